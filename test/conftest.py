@@ -48,7 +48,11 @@ def _starts_processes(path: Path) -> bool:
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Import no file that the marker expression of a phase leaves out as a whole: all of them take 8 s to import."""
     expression = str(config.getoption("markexpr"))
-    if collection_path.suffix != ".py" or "processes" not in expression:
+    if "processes" not in expression or collection_path == ROOT / "test":
+        return None
+    if collection_path.is_dir():  # with its conftest.py
+        return True if _starts_processes(collection_path) == ("not processes" in expression) else None
+    if collection_path.suffix != ".py":
         return None
     if _starts_processes(collection_path) == ("not processes" in expression):
         return True
@@ -93,17 +97,9 @@ def shared_data() -> Path:
 @pytest.fixture(scope="session")
 def wave(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The first 7 s of ``bags/tpose_wave``: the T-pose and some of the wave, for laws that do not need all of it."""
-    from body_tracking.recording.rosbag2 import BagReader, BagWriter
+    from excerpts import beginning
 
-    folder = tmp_path_factory.mktemp("excerpt") / "wave"
-    with BagReader(ROOT / "bags" / "tpose_wave") as bag, BagWriter(folder) as writer:
-        for topic, info in bag.topics.items():
-            writer.add_topic(topic, info.type_name, info.offered)
-        for raw in bag.messages():
-            if raw.log_time_ns > bag.start_ns + 7 * 10**9:
-                break
-            writer.write(raw.topic, raw.cdr, raw.log_time_ns, raw.publish_time_ns)
-    return folder
+    return beginning(ROOT / "bags" / "tpose_wave", tmp_path_factory.mktemp("excerpt") / "wave", 7.0)
 
 
 @pytest.fixture(scope="session")
@@ -113,4 +109,14 @@ def replayed_wave(tmp_path_factory: pytest.TempPathFactory, wave: Path) -> Path:
 
     folder = tmp_path_factory.mktemp("replayed") / "wave"
     replay(wave, folder, ReplaySettings(()))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def extended_wave(tmp_path_factory: pytest.TempPathFactory, wave: Path) -> Path:
+    """The same with the extended filter."""
+    from body_tracking.recording.replay import ReplaySettings, replay
+
+    folder = tmp_path_factory.mktemp("extended") / "wave"
+    replay(wave, folder, ReplaySettings((), filter_name="ekf"))
     return folder

@@ -272,13 +272,6 @@ def test_topics_have_known_types_and_publishers() -> None:
         assert topic.publisher in (*EXECUTABLES, "every node")
 
 
-def test_the_parameters_file_is_as_the_code_has_it() -> None:
-    pytest.importorskip("rclpy", reason="ROS is not installed")
-    text = (ROOT / "config" / "body_tracking.yaml").read_text(encoding="utf-8")
-    assert text == systems.config_text(), "run `make docs`"
-    assert set(yaml.safe_load(text)) == set(named(all_nodes_for(options_of())))
-
-
 # `launch` is not on PyPI: that the launch file runs is checked on a ROS install; here, that it compiles, that what it
 # takes from us is there, and that it repeats nothing of the table.
 

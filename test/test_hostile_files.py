@@ -249,7 +249,7 @@ sys.exit(code)
 """A command that prints the seconds of a processor and the kilobytes that it took."""
 
 
-@pytest.mark.parametrize("kind", some(["chunk", "metadata", "parameters", "pipe", "calibration"], 2))
+@pytest.mark.parametrize("kind", some(["chunk", "metadata", "parameters", "pipe", "calibration"]))
 def test_command_ends_with_2_and_one_line(tmp_path: Path, kind: str) -> None:
     given: list[object] = ["bag", "info", tmp_path]
     if kind == "metadata":

@@ -30,8 +30,9 @@ from body_tracking.messages.calibration import transform_to_pose
 from body_tracking.messages.diagnostics import statuses
 from body_tracking.pipeline import graph
 from body_tracking.recording.rig import RigReader
-from body_tracking.recording.rosbag2 import BagReader, BagWriter, deserialize, first_field
+from body_tracking.recording.rosbag2 import BagReader, deserialize, first_field
 from draws import ALL
+from excerpts import beginning
 
 pytest.importorskip("rclpy", reason="ROS is not installed")
 
@@ -157,17 +158,6 @@ CASES = [
     (MESH, ""),
     *((bag.name, each) for bag in sorted(BAGS.iterdir()) if bag.name != MARKERS for each in FILTERS),
 ]
-
-
-def beginning(bag: Path, excerpt: Path, seconds: float) -> Path:
-    """The first seconds of a bag."""
-    with BagReader(bag) as reader, BagWriter(excerpt) as writer:
-        for topic, info in reader.topics.items():
-            writer.add_topic(topic, info.type_name, info.offered)
-        for raw in reader.messages():
-            if raw.log_time_ns <= reader.start_ns + seconds * NANOSECONDS:
-                writer.write(raw.topic, raw.cdr, raw.log_time_ns, raw.publish_time_ns)
-    return excerpt
 
 
 @pytest.fixture(scope="module")

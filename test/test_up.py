@@ -149,12 +149,6 @@ def patient(**settings: Any) -> ReplaySettings:
     return ReplaySettings(("kinect1", "kinect2"), parameters=PATIENT, **settings)
 
 
-def reference_frames(bag: Path) -> int:
-    """How many frames of the reference sensor a recording has."""
-    with BagReader(bag) as reader:
-        return reader.topics[graph.skeleton_topic("kinect1")].count
-
-
 def angles_in(path: Path, topic: str) -> dict[int, Any]:
     """Position by capture time, and its names."""
     with BagReader(path) as reader:
@@ -226,31 +220,6 @@ def live_as_offline(
         said.append((rate, found, late_messages(live)))
         assert late_messages(live), said
     raise AssertionError(said)
-
-
-@pytest.mark.parametrize("filter_name", ["lkf_constant_velocity", "ekf"])
-def test_deviations_of_a_shipped_recording_are_finite_where_something_is_known(
-    tmp_path: Path, wave: Path, filter_name: str
-) -> None:
-    """Offline; live gives the same (test_live_equals_offline.py)."""
-    recording = tmp_path / "offline"
-    replay(wave, recording, patient(filter_name=filter_name))
-    live = angles_in(recording, STDDEVS)
-    assert len(live) > 0.7 * reference_frames(wave)
-    finite = np.isfinite(np.array(list(live.values())))
-    with BagReader(recording) as reader:
-        assert reader.whole
-        assert reader.topics[graph.skeleton_topic("kinect1")].count == reference_frames(wave)
-        if filter_name != "ekf":
-            # each angle is known at some time; the rotation of the arms while they are straight (T-pose) is not
-            assert finite.any(axis=0).all() and not finite.all()
-            assert graph.MODEL_STATE not in reader.topics
-            return
-        assert finite.all()  # posture tells what points do not
-        assert graph.MODEL_COVARIANCE not in reader.topics  # can be computed again
-        for topic in (graph.MODEL_STATE, graph.segments_topic("body1")):
-            assert reader.topics[topic].count == len(live)
-        assert reader.topics[graph.urdf_topic("body1")].count >= 1
 
 
 def two_people(folder: Path) -> tuple[Path, Path]:
@@ -334,7 +303,7 @@ def test_every_node_may_be_killed_and_tracking_is_back_within_three_seconds(
     assert stamps[-1] - stamps[0] > 0.8 * (last_ns - first_ns)
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("how", some([signal.SIGINT, signal.SIGKILL, signal.SIGTERM], 2))
 def test_no_process_remains(up: Callable[..., Up], tmp_path: Path, how: signal.Signals) -> None:
     graph_up = up("--bag", BAG, "--record", tmp_path / "recording")
     wanted = set(NODES) if how is signal.SIGINT else {"fusion", "calibration"}

@@ -131,25 +131,22 @@ def make_targets(seed: int = 0) -> tuple[Target, ...]:
     rng = np.random.default_rng(seed)
     found: list[Target] = []
     for name in SEGMENTS:
-        best, points = 0.0, np.zeros((5, 3))
-        for _ in range(_TRIALS):
-            drawn = rng.uniform(-0.5, 0.5, (5, 3)) * np.array([1.0, 1.0, 0.45])
-            drawn *= EXTENT / _distances(drawn).max()
-            own = _distances(drawn)
-            if own.min() < _APART:
-                continue
-            others = np.concatenate([own, *(_distances(each.points) for each in found)])
-            # distances within a target far from each other, those of different targets less so
-            worth = min(np.diff(np.sort(own)).min() / 0.002, np.diff(np.sort(others)).min() / 3e-4)
-            if worth > best:
-                best, points = worth, drawn - drawn.mean(axis=0)
-        found.append(Target(name, points, np.zeros((15, 15)), DIAMETER))
+        drawn = rng.uniform(-0.5, 0.5, (_TRIALS, 5, 3)) * np.array([1.0, 1.0, 0.45])
+        drawn *= (EXTENT / _distances(drawn).max(axis=1))[:, None, None]
+        own = _distances(drawn)
+        others = np.hstack([own, *(np.tile(_distances(each.points), (_TRIALS, 1)) for each in found)])
+        # distances within a target far from each other, those of different targets less so
+        smallest = (np.diff(np.sort(each, axis=1)).min(axis=1) for each in (own, others))
+        worth = np.minimum(next(smallest) / 0.002, next(smallest) / 3e-4)
+        best = drawn[np.where(own.min(axis=1) < _APART, 0.0, worth).argmax()]
+        found.append(Target(name, best - best.mean(axis=0), np.zeros((15, 15)), DIAMETER))
     return tuple(found)
 
 
 def _distances(points: FloatArray) -> FloatArray:
-    """(10,) between five points, metres."""
-    apart: FloatArray = np.linalg.norm(points[:, None] - points[None], axis=2)[np.triu_indices(5, 1)]
+    """(..., 10) between five points (..., 5, 3), metres."""
+    first, second = np.triu_indices(5, 1)
+    apart: FloatArray = np.linalg.norm(points[..., first, :] - points[..., second, :], axis=-1)
     return apart
 
 

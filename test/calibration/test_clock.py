@@ -128,7 +128,7 @@ def test_offset_and_drift_are_fitted_within_the_stated_uncertainty(offset: float
         assert offset_at(found, at) == pytest.approx(offset + drift * at, abs=0.011)
 
 
-@pytest.mark.parametrize("phase", [0.0, 0.005, 0.013, 0.0167, 0.025])
+@pytest.mark.parametrize("phase", [0.0, 0.013, 0.025])
 def test_the_offset_does_not_follow_the_phase_of_the_frames(phase: float) -> None:
     """Samples half-way between two frames have half the noise, and so correlate better."""
 
@@ -171,7 +171,7 @@ def test_what_is_known_exactly_is_kept() -> None:
 
 
 def test_the_same_motion_again_says_no_more_of_the_offset_but_of_the_drift() -> None:
-    once, often = fitted(0.02, 0.0), fitted(0.02, 0.0, repeated=10)
+    once, often = fitted(0.02, 0.0), fitted(0.02, 0.0, repeated=6)
     floor = np.sqrt((once.stddev**2 - MIN_STDDEV**2) / 2.0 + MIN_STDDEV**2)  # after a minute half is common to all
     assert 0.95 * floor < often.stddev < once.stddev
     assert often.drift_stddev_ppm < 0.5 * once.drift_stddev_ppm

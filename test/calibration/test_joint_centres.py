@@ -26,7 +26,7 @@ from body_tracking.core.skeleton import MIRROR, N_JOINTS, NANOSECONDS, FloatArra
 from body_tracking.evaluation.segments import segment_frames
 from body_tracking.kinect.csv_recording import CsvRecording
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
-from draws import some
+from draws import draws, some
 from walkers import performed
 
 T_POSE = performed("reaching", np.array([1.0]))[0]
@@ -166,7 +166,7 @@ def test_left_and_right_are_treated_alike() -> None:
 
 def test_angles_are_better_in_all_poses_after_a_t_pose() -> None:
     before, after = [], []
-    for seed in range(20):
+    for seed in range(draws(8, 20)):
         local = some_offsets(seed)
         counters: dict[str, int] = {}
         centres = JointCentres(counters)

@@ -148,7 +148,7 @@ def test_the_thesis_method_keeps_its_still_pose(shared_data: Path) -> None:
             ("calf_raise", 1005),  # the first movement looks like another one
             ("arm_raises", 2003),
         ],
-        3,
+        2,
     ),
 )
 def test_people_who_stay_on_the_spot_are_enough(motion: str, seed: int) -> None:
@@ -200,7 +200,7 @@ def _walked(seconds: float) -> OnlineCalibration:
     return run(stream(seconds))[0]
 
 
-def saved_after(seconds: float = 20.0, turned: float = 0.0) -> CalibrationResult:
+def saved_after(seconds: float = 15.0, turned: float = 0.0) -> CalibrationResult:
     """Calibration from some seconds of the walk; with kinect2 turned since, degrees about the vertical."""
     saved = _walked(seconds).result()
     pose = saved.poses["kinect2"]
@@ -270,7 +270,7 @@ def test_somebody_who_never_stands_still_is_enough() -> None:
 
 def test_arrival_times_are_only_a_first_guess() -> None:
     """The same frames with their arrival shaken by up to a frame give the same calibration."""
-    orderly, shaken = saved_after(), run(stream(20.0, jitter=0.03))[0].result()
+    orderly, shaken = saved_after(), run(stream(15.0, jitter=0.03))[0].result()
     assert_allclose(shaken.poses["kinect2"].translation, orderly.poses["kinect2"].translation, atol=1e-9)
     assert_allclose(shaken.poses["kinect2"].rotation, orderly.poses["kinect2"].rotation, atol=1e-9)
     assert shaken.clocks == orderly.clocks
@@ -298,7 +298,7 @@ def test_neither_a_still_pose_nor_motion_that_tells_the_clock_is_needed() -> Non
 
 
 def test_stamps_since_an_epoch_are_as_good_as_small_ones() -> None:
-    small, large = saved_after(), run(stream(20.0, start=1_790_000_000.0))[0].result()
+    small, large = saved_after(), run(stream(15.0, start=1_790_000_000.0))[0].result()
     assert_allclose(large.poses["kinect2"].translation, small.poses["kinect2"].translation, atol=1e-4)
     assert abs(large.clocks["kinect2"].offset_ns - small.clocks["kinect2"].offset_ns) < 100_000
 
@@ -348,7 +348,7 @@ def test_a_clock_that_was_saved_when_stamps_were_no_ros_time_is_never_used(offse
 
 
 def test_a_saved_clock_of_another_session_is_not_believed() -> None:
-    calibration, _ = run(stream(20.0, offset=-30.0), saved=saved_after())
+    calibration, _ = run(stream(15.0, offset=-30.0), saved=saved_after())
     assert calibration.result().clocks["kinect2"].offset == pytest.approx(-30.0, abs=0.02)
 
 
@@ -381,7 +381,7 @@ def test_a_saved_clock_is_known_better_than_from_motion_that_looks_different_fro
     assert abs(kept) < 0.003
     assert kept_stddev < 0.004
     # Saved two days ago, or after a recording too short for the drift: no better than times of receipt.
-    for ago, drift_stddev_ppm in ((2 * 86_400, 5.0), (300, float("inf"))):
+    for ago, drift_stddev_ppm in some(((2 * 86_400, 5.0), (300, float("inf")))):
         then_ns = true.anchor_ns - ago * NANOSECONDS
         assert off(true.carried_to(then_ns), drift_stddev_ppm) == pytest.approx((error, stddev), abs=1e-3)
 
@@ -389,7 +389,7 @@ def test_a_saved_clock_is_known_better_than_from_motion_that_looks_different_fro
 @pytest.mark.parametrize("offset", some([0.53, 0.46, 0.5, 0.545]))
 def test_a_clock_that_was_set_since_it_was_saved_is_found_anew(offset: float) -> None:
     """Even by less than the accuracy of the times of receipt."""
-    saved = saved_after(30.0)
+    saved = saved_after()
     saved.quality["kinect2"] = replace(saved.quality["kinect2"], clock_stddev=0.003)
     calibration, _ = run(stream(float(draws(25, 40)), offset=offset), saved=saved)
     assert sum("was set since" in event for event in calibration.events) == 1
@@ -400,7 +400,7 @@ def test_a_clock_that_was_set_since_it_was_saved_is_found_anew(offset: float) ->
 
 def test_a_bag_that_loops_keeps_the_poses_and_says_no_more_of_the_clock() -> None:
     once = saved_after()
-    calibration, _ = run((*stream(20.0), *stream(20.0)))
+    calibration, _ = run((*stream(15.0), *stream(15.0)))
     twice = calibration.result()
     assert any("went back" in event for event in calibration.events)
     assert Rotation.from_matrix(between(twice)[0] @ between(once)[0].T).magnitude() < np.radians(0.5)
@@ -462,6 +462,6 @@ def broken(frames: tuple[tuple[str, Skeleton, int], ...]) -> Iterator[tuple[str,
 
 @pytest.mark.filterwarnings("error")
 def test_broken_frames_do_no_harm() -> None:
-    calibration, _ = run(tuple(broken(stream(20.0))))
+    calibration, _ = run(tuple(broken(stream(15.0))))
     assert yaw_error(calibration.finish()) < 1.0
     assert calibration.status()[2]["kinect2 late_frames"] > 0

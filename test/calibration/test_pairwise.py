@@ -13,6 +13,7 @@ from body_tracking.calibration.coverage import Coverage
 from body_tracking.calibration.pairwise import Pairs, estimate, same_sense, start_from_midline
 from body_tracking.calibration.rigid import CalibrationError, rigid_registration
 from body_tracking.core.skeleton import MIRROR, FloatArray
+from draws import draws
 from walkers import about_y, walk
 
 ROTATION, TRANSLATION = about_y(-70.0), np.array([2.0, 0.1, 2.2])
@@ -56,7 +57,7 @@ def test_the_stated_uncertainty_covers_the_error() -> None:
     stated = []
     for times, places, distortion in ((STILL, 1, 0.05), (WALK, 20, 0.05 / np.sqrt(6.0))):
         normalised = []
-        for seed in range(30):
+        for seed in range(draws(12, 30)):
             pairs = pairs_of(times, distortion, seed=seed, places=places)
             found = estimate(pairs, ROTATION, TRANSLATION)
             turn = Rotation.from_matrix(ROTATION @ found.rotation.T).as_rotvec()

@@ -65,12 +65,13 @@ def measured(truth: Truth, noise: float = NOISE, seed: int = 0, **errors: object
     return observe(truth, MeasurementErrors(noise, **errors), np.random.default_rng(seed))  # type: ignore[arg-type]
 
 
-def run(estimator: ExtendedKalmanFilter, skeletons: Iterable[Skeleton], sensor: str = "") -> list[Skeleton | None]:
-    return [estimator.update(skeleton, sensor) for skeleton in skeletons]
+def run(estimator: ExtendedKalmanFilter, skeletons: Sequence[Skeleton], first: int = 0) -> list[Skeleton | None]:
+    """The outputs, from the frame of that number on: each takes a third of the time."""
+    feed(estimator, skeletons[:first])
+    return [None] * first + [estimator.update(skeleton) for skeleton in skeletons[first:]]
 
 
 def feed(estimator: ExtendedKalmanFilter, skeletons: Iterable[Skeleton]) -> None:
-    """Like :func:`run` without the outputs, which take a third of its time."""
     for skeleton in skeletons:
         estimator.take(skeleton)
 
@@ -112,12 +113,11 @@ def assert_sound(outputs: Iterable[Skeleton | None], estimator: ExtendedKalmanFi
 # --- following
 
 
-@pytest.mark.parametrize("noise", [0.005, 0.02, 0.05])
+@pytest.mark.parametrize("noise", [0.005, 0.05])
 def test_it_follows_a_moving_person_closer_than_the_measurements(noise: float) -> None:
-    truth = random_truth(1, 3.0)
-    observation = measured(truth, noise)
+    truth = random_truth(1, 2.0)
     estimator = ExtendedKalmanFilter()
-    outputs = run(estimator, observation.skeletons)
+    outputs = run(estimator, measured(truth, noise).skeletons)
     assert [output is None for output in outputs] == [k < START_FRAMES - 1 for k in range(len(outputs))]
     raw = np.sqrt(3.0) * noise
     assert rms(errors_of(outputs, truth)) < 0.9 * raw
@@ -141,7 +141,7 @@ def test_joint_centre_offsets_are_in_the_published_covariance() -> None:
     # of forearms and hands it is true to first order only
     near = np.array([k for k in OBSERVED if not MODEL.coordinate_names[k].startswith(("forearm", "wrist"))])
     considered, ignored = [], []
-    count = draws(8, 60)
+    count = draws(5, 60)
     for seed in range(count):
         truth = random_truth(100 + seed, 1.0, rate=15.0)
         offsets = BASE_STDDEV[:, None] * rng.normal(size=(N_JOINTS, 3))
@@ -168,7 +168,7 @@ def test_joint_centre_offsets_are_in_the_published_covariance() -> None:
 def test_sensors_that_contradict_each_other_do_not_start_it_anew_time_and_again() -> None:
     """Four that are off by 4 cm each in their own way: no pose is right for all, and looking for one is of no use."""
     rng = np.random.default_rng(3)
-    truth = random_truth(3, 3.0)
+    truth = random_truth(3, 1.5)
     stated = np.broadcast_to(np.diag([0.03**2] * 3), (N_JOINTS, 3, 3))
     offsets = {name: 0.04 * rng.normal(size=(N_JOINTS, 3)) for name in "abcd"}
     estimator = ExtendedKalmanFilter()
@@ -176,8 +176,8 @@ def test_sensors_that_contradict_each_other_do_not_start_it_anew_time_and_again(
         for place, (name, offset) in enumerate(offsets.items()):
             stamp_ns = frame.stamp_ns + place * 8_000_000
             moved = replace(frame, stamp_ns=stamp_ns, positions=frame.positions + offset, covariances=stated)
-            estimator.update(moved, name)
-    assert estimator.counters["restarts"] <= 1  # looked for every quarter of a second it was 12 in 5 s
+            estimator.take(moved, name)
+    assert estimator.counters["restarts"] <= 1  # looked for every quarter of a second it was one in 0.4 s
 
 
 def test_its_uncertainty_is_true() -> None:
@@ -188,7 +188,7 @@ def test_its_uncertainty_is_true() -> None:
     for_angles, for_points, for_lengths = [], [], []
     distance, dimension, frames = 0.0, 0, 0
     for seed in range(draws(2, 10)):
-        truth = random_truth(20 + seed, 6.0)
+        truth = random_truth(20 + seed, 4.0)
         observation = measured(truth, 0.01 + 0.005 * (seed % 5), seed)
         estimator = ExtendedKalmanFilter()
         for skeleton, k in zip(observation.skeletons, observation.frames, strict=True):
@@ -214,8 +214,8 @@ def test_its_uncertainty_is_true() -> None:
 
 
 def test_lengths_stay_once_they_are_known_and_the_output_has_them() -> None:
-    truth = random_truth(2, 8.0)
-    estimator = ExtendedKalmanFilter(EkfParameters(settle_time=4.0))
+    truth = random_truth(2, 5.0)
+    estimator = ExtendedKalmanFilter(EkfParameters(settle_time=3.0))
     found = []
     for skeleton in measured(truth).skeletons:
         output = estimator.update(skeleton)
@@ -226,8 +226,8 @@ def test_lengths_stay_once_they_are_known_and_the_output_has_them() -> None:
             output.positions[POINTS], MODEL.forward(estimate.q, estimate.lengths).positions, rtol=0.0, atol=1e-12
         )
         found.append((skeleton.stamp_ns, estimate.lengths))
-    settled = np.stack([lengths for stamp_ns, lengths in found if stamp_ns > START_NS + 4.2 * NANOSECONDS])
-    assert len(settled) > 100
+    settled = np.stack([lengths for stamp_ns, lengths in found if stamp_ns > START_NS + 3.2 * NANOSECONDS])
+    assert len(settled) > 50
     assert np.abs(settled - settled[0]).max() < 1e-9
     assert np.abs(settled[0] - found[0][1]).max() > 1e-3  # they had been learnt before
     assert np.abs(settled[0] - truth.lengths).max() < 0.5 * np.abs(found[0][1] - truth.lengths).max()
@@ -242,7 +242,7 @@ def test_lengths_come_from_many_poses_once_there_are_some() -> None:
     changes, normalised = [], []
     before = None
     for skeleton, k in zip(observation.skeletons, observation.frames, strict=True):
-        estimator.update(skeleton)
+        estimator.take(skeleton)
         state = estimator._state
         if state is None or not state.settled:
             continue
@@ -258,11 +258,11 @@ def test_lengths_come_from_many_poses_once_there_are_some() -> None:
 
 
 def test_a_person_who_seems_turned_around_keeps_the_lengths() -> None:
-    truth = random_truth(16, 12.0)
+    truth = random_truth(16, 8.5)
     skeletons = list(measured(truth).skeletons)
     # as a Kinect does with a person seen from behind: left and right change places for some seconds
     turned = [
-        replace(each, positions=each.positions[MIRROR]) if 7.0 < time < 10.0 else each
+        replace(each, positions=each.positions[MIRROR]) if 5.0 < time < 7.0 else each
         for each, time in zip(skeletons, truth.times, strict=True)
     ]
     estimator = ExtendedKalmanFilter()
@@ -272,9 +272,9 @@ def test_a_person_who_seems_turned_around_keeps_the_lengths() -> None:
 
 
 def test_another_person_of_another_size_is_learnt_anew() -> None:
-    truth = random_truth(18, 16.0)
+    truth = random_truth(18, 10.0)
     skeletons = [
-        replace(each, positions=0.65 * each.positions) if time > 8.0 else each
+        replace(each, positions=0.65 * each.positions) if time > 5.0 else each
         for each, time in zip(measured(truth).skeletons, truth.times, strict=True)
     ]
     estimator = ExtendedKalmanFilter()
@@ -294,7 +294,7 @@ def test_it_depends_neither_on_the_origin_of_world_nor_on_the_side(
     signs: list[float], order: IntArray, origin: FloatArray
 ) -> None:
     here, there = ExtendedKalmanFilter(), ExtendedKalmanFilter()
-    for skeleton in measured(random_truth(3, 3.0), outliers=0.02).skeletons:
+    for skeleton in measured(random_truth(3, 1.5), outliers=0.02).skeletons:
         one = here.update(skeleton)
         moved = skeleton.positions[order] * signs + origin
         other = there.update(replace(skeleton, positions=moved, states=skeleton.states[order]))
@@ -310,7 +310,7 @@ def test_it_depends_neither_on_the_origin_of_world_nor_on_the_side(
 def test_two_sensors_are_better_than_either_and_the_better_one_counts_more() -> None:
     """At 20 and 40 mm the plain mean of both would be worse than the better one alone."""
     results = []
-    for seed in range(draws(2, 4)):
+    for seed in range(draws(1, 4)):
         rng = np.random.default_rng(40 + seed)
         person, motion = RandomPerson.draw(rng), RandomMotion(rng, 5.0)
         times = capture_times(3.0, rng, 25.0)
@@ -360,7 +360,7 @@ def test_late_frames_count_as_if_they_had_come_in_order() -> None:
     frames.sort(key=lambda each: each[0].stamp_ns)
     in_order, late = ExtendedKalmanFilter(), ExtendedKalmanFilter()
     for skeleton, name in frames:
-        in_order.update(skeleton, name)
+        in_order.take(skeleton, name)
     name_of = {skeleton.stamp_ns: name for skeleton, name in frames}
     outputs = [
         late.update(skeleton, name_of[skeleton.stamp_ns])
@@ -377,7 +377,7 @@ def stalled(seed: int, held: int = 6) -> tuple[list[tuple[Skeleton, str]], int]:
     person, motion = RandomPerson.draw(rng), RandomMotion(rng, 2.0)
     frames = []
     for number in range(2):
-        truth = truth_of(person, motion, capture_times(1.5, rng) + 0.017 * number)
+        truth = truth_of(person, motion, capture_times(1.0, rng) + 0.017 * number)
         frames += [(skeleton, f"kinect{number}") for skeleton in measured(truth, seed=number).skeletons]
     frames.sort(key=lambda each: each[0].stamp_ns)
     if frames[-1][1] == "kinect1":
@@ -438,19 +438,18 @@ def test_what_is_too_late_is_dropped_and_counted() -> None:
     assert_same(before, known(estimator), 0.0)
 
 
-@pytest.mark.parametrize("repeated", [0, 15])
-@pytest.mark.parametrize("after", [*range(4, 12), 18])
-def test_an_older_frame_that_is_repeated_counts_once(repeated: int, after: int) -> None:
-    """Also that by which the filter was started."""
-    skeletons = measured(random_truth(8, 0.6)).skeletons
-    once, twice = ExtendedKalmanFilter(), ExtendedKalmanFilter()
+def test_an_older_frame_that_is_repeated_counts_once() -> None:
+    """Also those by which the filter was started, before the start and for as long as they are remembered."""
+    skeletons = measured(random_truth(8, 0.4)).skeletons
+    once = ExtendedKalmanFilter()
     feed(once, skeletons)
-    feed(twice, skeletons[:after])
-    again = skeletons[min(repeated, after - 3)]
-    assert twice.update(again) is None
-    feed(twice, skeletons[after:])
-    assert twice.counters["repeated_stamps"] == 1
-    assert_same(known(once), known(twice), 1e-12)
+    for repeated, after in ((0, 4), (0, 5), (0, 8), (2, 5), (5, 8), (9, 12)):
+        twice = ExtendedKalmanFilter()
+        feed(twice, skeletons[:after])
+        assert twice.update(skeletons[repeated]) is None
+        feed(twice, skeletons[after:])
+        assert twice.counters["repeated_stamps"] == 1
+        assert_same(known(once), known(twice), 1e-12)
 
 
 def test_a_start_in_another_order_is_the_same_start() -> None:
@@ -462,8 +461,8 @@ def test_a_start_in_another_order_is_the_same_start() -> None:
 
 
 def test_after_a_gap_it_goes_on_with_the_lengths_it_knew() -> None:
-    truth = random_truth(10, 9.0)
-    observation = measured(truth, gaps=((3.0, 7.0),))
+    truth = random_truth(10, 7.0)
+    observation = measured(truth, gaps=((2.0, 6.0),))
     estimator = ExtendedKalmanFilter()
     outputs: list[Skeleton | None] = [None] * len(truth.times)
     lengths = []
@@ -472,10 +471,10 @@ def test_after_a_gap_it_goes_on_with_the_lengths_it_knew() -> None:
         if estimator.estimate is not None:
             lengths.append((truth.times[k], known(estimator).lengths))
     assert estimator.counters["gaps"] == 1
-    before = [each for time, each in lengths if time < 3.0][-1]
-    after = next(each for time, each in lengths if time > 7.0)
+    before = [each for time, each in lengths if time < 2.0][-1]
+    after = next(each for time, each in lengths if time > 6.0)
     assert_allclose(after, before, rtol=0.0, atol=1e-12)
-    assert rms(errors_of(outputs, truth, 7.3)) < np.sqrt(3.0) * NOISE
+    assert rms(errors_of(outputs, truth, 6.3)) < np.sqrt(3.0) * NOISE
 
 
 # --- prediction
@@ -523,7 +522,7 @@ def test_a_prediction_continues_the_movement() -> None:
 
 @pytest.mark.parametrize("missing", [ARMS["LEFT"], EVERYTHING], ids=["an arm", "everybody"])
 def test_what_is_missing_is_predicted_and_comes_back(missing: tuple[Joint, ...]) -> None:
-    truth = random_truth(16, 4.0, tempo=0.6)
+    truth = random_truth(16, 3.2, tempo=0.6)
     lost = np.isin(POINTS, missing)
     during = (truth.times >= 2.0) & (truth.times < 2.5)
     estimator = ExtendedKalmanFilter()
@@ -576,7 +575,7 @@ def bent_hands(count: int, seconds: float, bent_at: float = 0.0) -> list[tuple[i
     return found[:count]
 
 
-@pytest.mark.parametrize(("begin", "noise"), [(0.0, 0.006), (0.0, 0.013), (0.0, 0.025), (0.7, 0.006), (0.7, 0.02)])
+@pytest.mark.parametrize(("begin", "noise"), [(0.0, 0.006), (0.0, 0.025), (0.7, 0.02)])
 def test_a_hand_turned_over_is_right_soon(begin: float, noise: float) -> None:
     """From the start, or later, as if an unseen movement had ended in the wrong pose: after 1.5 s at most."""
     seconds, end = (1.2, 0.5) if begin == 0.0 else (2.5, 2.2)
@@ -601,10 +600,10 @@ def test_a_hand_turned_over_is_right_soon(begin: float, noise: float) -> None:
 def test_an_arm_that_comes_back_elsewhere_is_found_within_two_frames() -> None:
     """After a second unseen, in which it went on briskly: an update linearised where it was can end anywhere."""
     for seed in range(320, 320 + draws(2, 12)):
-        truth = random_truth(seed, 2.4, tempo=1.6)
+        truth = random_truth(seed, 2.3, tempo=1.6)
         for arm in ARMS.values():
             estimator = ExtendedKalmanFilter()
-            outputs = run(estimator, measured(truth, 0.008, dropouts=(Dropout(1.0, 2.0, arm),)).skeletons)
+            outputs = run(estimator, measured(truth, 0.008, dropouts=(Dropout(1.0, 2.0, arm),)).skeletons, 60)
             assert errors_of(outputs, truth, 2.05)[:, np.isin(POINTS, arm)].max() < 0.15, (seed, arm)
 
 
@@ -613,7 +612,7 @@ def test_outliers_hardly_matter() -> None:
     clean: list[float] = []
     bad: list[float] = []
     for seed in range(draws(1, 2)):
-        truth = random_truth(60 + seed, 5.0)
+        truth = random_truth(60 + seed, 3.0)
         for errors, share in ((clean, 0.0), (bad, 0.05)):
             estimator = ExtendedKalmanFilter()
             outputs = run(estimator, measured(truth, seed=seed, outliers=share).skeletons)
@@ -637,17 +636,23 @@ def damaged(skeleton: Skeleton, field: str, value: float, rng: np.random.Generat
 
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
 @pytest.mark.parametrize(
-    ("field", "value"),
-    [("positions", value) for value in (np.nan, -np.inf, 150.0, -1e6, 1e300)]
-    + [("covariances", value) for value in (np.nan, 0.0, -1e-3, np.inf, 1e12, 1e-15)]
-    + [("all positions", np.nan), ("all states", TrackingState.NOT_TRACKED)],
+    ("field", "values"),
+    [
+        ("positions", (np.nan, 150.0, 1e300)),
+        ("positions", (-np.inf, -1e6)),
+        ("covariances", (np.nan, 0.0, 1e12)),
+        ("covariances", (-1e-3, np.inf, 1e-15)),
+        ("all positions", (np.nan,)),
+        ("all states", (TrackingState.NOT_TRACKED,)),
+    ],
 )
-def test_damaged_numbers_do_no_harm(field: str, value: float) -> None:
+def test_damaged_numbers_do_no_harm(field: str, values: tuple[float, ...]) -> None:
     """In every third frame, from the first one on; the frames between are enough."""
-    truth = random_truth(70, 1.8)
+    truth = random_truth(70, 1.6)
     rng = np.random.default_rng(1)
     skeletons = list(measured(truth).skeletons)
     for k in range(0, len(skeletons), 3):
+        value = values[k // 3 % len(values)]
         whole = field.removeprefix("all ")
         if whole == field:
             skeletons[k] = damaged(skeletons[k], field, value, rng)
@@ -685,7 +690,7 @@ def test_of_a_person_who_stands_no_unobserved_angle_drifts_or_is_told() -> None:
     seed = 0
     rng = np.random.default_rng(seed)
     lengths = RandomPerson.draw(rng).lengths
-    times = capture_times(float(draws(8, 40)), rng, 30.0)
+    times = capture_times(float(draws(5, 40)), rng, 30.0)
     tangent = np.zeros(MODEL.nv)
     tangent[[MODEL.coordinate_names.index(f"elbow_flexion_{side}") for side in ("left", "right")]] = np.radians(25.0)
     tangent[6:12] = np.radians(rng.normal(scale=4.0, size=6))

@@ -80,7 +80,7 @@ def test_it_equals_25_independent_filterpy_filters(model: str) -> None:
     singles = [KalmanFilter(dim_x=3 * order, dim_z=3) for _ in range(N_JOINTS)]
     stamp_ns, position = 1, BODY.copy()
     seen_before = np.ones(N_JOINTS, dtype=bool)
-    for frame in range(draws(50, 120)):
+    for frame in range(draws(30, 120)):
         step = 0.0 if frame == 0 else float(rng.uniform(0.01, 0.2))
         stamp_ns += round(step * NANOSECONDS)
         step = round(step * NANOSECONDS) / NANOSECONDS
@@ -131,7 +131,7 @@ def test_it_equals_25_independent_filterpy_filters(model: str) -> None:
 
 @pytest.mark.parametrize("model", LINEAR_MODELS)
 @given(split=st.floats(0.05, 0.95), step_ms=st.integers(10, 400))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=draws(10, 25))
 def test_two_part_steps_of_prediction_equal_the_whole(model: str, split: float, step_ms: int) -> None:
     whole, parts = (LinearKalmanFilter(model, LinearKalmanParameters(predict_for=10.0)) for _ in range(2))
     missing = np.zeros(N_JOINTS, dtype=np.uint8)
@@ -318,7 +318,7 @@ def test_the_slow_part_of_the_noise_opens_the_gate_and_stays_in_the_covariance()
     covariance=arrays(np.float64, (3, 3), elements=st.floats(allow_nan=True, allow_infinity=True)),
 )
 @example(np.zeros((N_JOINTS, 3)), np.ones(N_JOINTS, dtype=np.uint8), np.full((3, 3), 1.28326561e-16))
-@settings(max_examples=draws(25, 60), deadline=None)
+@settings(max_examples=draws(12, 60))
 def test_no_number_whatever_gets_into_the_state(
     model: str, positions: FloatArray, states: np.ndarray, covariance: FloatArray
 ) -> None:

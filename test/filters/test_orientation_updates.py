@@ -21,7 +21,6 @@ from body_tracking.core.orientation import SEGMENT_NUMBER, SegmentOrientation
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton
 from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
 from body_tracking.filters.ekf import sources as orientation
-from body_tracking.filters.ekf.priors import _HELD_STDDEV, _LIMIT_STDDEV
 from body_tracking.filters.ekf.sources import PER_SOURCE, Sources
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UNOBSERVED
@@ -37,7 +36,7 @@ from body_tracking.simulation.random_people import (
     observe,
     truth_of,
 )
-from draws import draws
+from draws import draws, some
 
 NAMES = MODEL.coordinate_names
 PRONATION = [NAMES.index(f"forearm_pronation_{side}") for side in ("left", "right")]
@@ -199,7 +198,7 @@ def random_pose(rng: np.random.Generator) -> FloatArray:
     return MODEL.integrate(MODEL.neutral(), 0.7 * rng.normal(size=MODEL.nv))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=draws(8, 25))
 @given(st.integers(0, 10**6), st.booleans())
 def test_derivatives_of_an_orientation_against_differences(seed: int, corrected: bool) -> None:
     rng = np.random.default_rng(seed)
@@ -320,26 +319,6 @@ def test_what_nothing_tells_keeps_its_deviation() -> None:
     assert stddev[2] > 0.7 * p.misalignment_stddev
 
 
-def test_a_range_that_pushes_back_turns_no_segment_that_a_source_holds() -> None:
-    """Else the next orientation would find the segment turned, and correct the source by a part of it, each time."""
-    person = worn_person(13, 2.0, 0.01, HANDS)
-    estimator = ExtendedKalmanFilter()
-    feed(estimator, in_order(person.skeletons, Source("forearm_left", stated=0.01).measure(person)))
-    held = estimator._state
-    assert held is not None
-    loose = held.but(sources=Sources.none(), covariance=held.covariance[:BODY, :BODY], crosses=held.crosses[:BODY])
-    row = np.eye(MODEL.nv)[PRONATION[:1]]
-    turned = []
-    for state in (held, loose):
-        pushed = estimator._priors._pushed_back(state, row, np.array([0.5]))
-        before, after = (MODEL.turning(each.q, SEGMENT_NUMBER["forearm_left"])[0] for each in (state, pushed))
-        turned.append(np.linalg.norm(so3.rotation_vectors(after @ before.T)))
-        assert_allclose(pushed.sources.misalignment, state.sources.misalignment, rtol=0.0, atol=1e-12)
-    # about one axis the gain of a push is v / (v + limit^2), and held by a source v is less than held^2
-    limit, hold = np.radians(_LIMIT_STDDEV) ** 2, _HELD_STDDEV**2
-    assert turned[0] < 0.5 * hold / (hold + limit) < 0.5 * turned[1]
-
-
 ALL_BUT_HANDS = ("pelvis", "upper_trunk", "head", "upper_arm_left", "forearm_left", "upper_arm_right", "forearm_right")
 
 
@@ -356,7 +335,7 @@ def still(posture: dict[str, float], seconds: float, until: dict[str, float] | N
             rotations[SEGMENT_NUMBER[segment]],
             0.2**2 * np.eye(3),
         )
-        for time in np.arange(0.0, seconds, 0.05)
+        for time in np.arange(0.0, seconds, 0.1)
         for number, segment in enumerate(ALL_BUT_HANDS)
         if time < (until or {}).get(segment, np.inf)
     ]
@@ -385,7 +364,7 @@ def test_what_a_silent_source_said_no_more_is_bounded_by_the_ranges() -> None:
     assert np.radians(20.0) < deviation < 1.5 * Ranges(MODEL).stddev[elbow - 6]
 
 
-@pytest.mark.parametrize("turn", [(0.35, 0.0, 0.0), (0.0, 0.35, 0.0), (0.0, 0.0, 0.35)])
+@pytest.mark.parametrize("turn", [(0.35, 0.0, 0.0), (0.0, 0.0, 0.35)])
 def test_a_sensor_that_slips_leaves_the_angles_sound(turn: tuple[float, float, float]) -> None:
     person = worn_person(4, 7.0, 0.01)
     source = Source("upper_arm_right", slip=(3.5, turn))
@@ -435,11 +414,11 @@ def turned_away(person: Person, begin: float, end: float) -> list[Skeleton]:
 
 
 def test_a_body_that_a_camera_takes_to_face_it_stays_turned_as_its_arms_tell() -> None:
-    person = worn_person(3, 5.5)
+    person = worn_person(3, 4.2)
     worn = Source("forearm_left", (0.05, 0.0, 0.1), 0.1, 0.05)
     estimator = ExtendedKalmanFilter()
-    errors, covariances = followed(estimator, in_order(turned_away(person, 2.5, 5.0), worn.measure(person)), person)
-    assert estimator.counters["sides_swapped"] > 60
+    errors, covariances = followed(estimator, in_order(turned_away(person, 2.0, 4.0), worn.measure(person)), person)
+    assert estimator.counters["sides_swapped"] > 48
     assert np.degrees(np.abs(errors[:, 5]).max()) < 15.0
     unturned, _ = followed(ExtendedKalmanFilter(), in_order(person.skeletons, worn.measure(person)), person)
     assert rms(errors[:, 3:6]) < 1.5 * rms(unturned[:, 3:6])
@@ -447,7 +426,7 @@ def test_a_body_that_a_camera_takes_to_face_it_stays_turned_as_its_arms_tell() -
 
     # with the camera alone the swap is not detected
     alone = ExtendedKalmanFilter()
-    errors, _ = followed(alone, turned_away(person, 2.5, 5.0), person)
+    errors, _ = followed(alone, turned_away(person, 2.0, 4.0), person)
     assert alone.counters["sides_swapped"] == 0
     assert np.degrees(np.abs(errors[:, 5]).max()) > 90.0
 
@@ -457,9 +436,10 @@ TURNED_ROUND = 0.035
 7 of 200 seeds. A defect of the filter: it should be none."""
 
 
+@pytest.mark.slow
 def test_filter_that_began_turned_round_recovers_in_most_cases() -> None:
-    """The share that stays turned round is no larger than the known one."""
-    count = draws(2, 200)
+    """The share that stays turned round is no larger than the known one, which two people could not say."""
+    count = draws(20, 200)
     turned = 0
     for seed in range(count):
         person = worn_person(seed, 8.0)
@@ -546,13 +526,13 @@ def test_a_new_source_has_not_slipped_with_its_second_word() -> None:
     assert estimator.counters["slips"] == 1
 
 
-@pytest.mark.parametrize("spin", [None, 0.05], ids=["orientations alone", "with rates"])
+@pytest.mark.parametrize("spin", some([0.05, None]), ids=str)
 def test_it_knows_how_sure_it_is_of_what_correlated_errors_leave(spin: float | None) -> None:
     observed = np.array([k for k, name in enumerate(NAMES) if name not in UNOBSERVED and k >= 6])
     p, normalised = EkfParameters(), []
     for seed in range(draws(1, 3)):
         rng = np.random.default_rng([seed, 8])
-        person = worn_person(30 + seed, 5.0)
+        person = worn_person(30 + seed, 4.0)
         sources = [
             Source(
                 segment,
@@ -600,7 +580,7 @@ def test_angular_velocities_correct_velocities_and_nothing_else() -> None:
 
 def test_how_quickly_joints_turn_is_known_better_by_rates() -> None:
     observed = [NAMES.index(name) for name in ("elbow_flexion_left", "forearm_pronation_left")]
-    errors = np.empty((draws(2, 6), 2))
+    errors = np.empty((draws(1, 6), 2))
     for number in range(len(errors)):
         person = worn_person(16 + number, 2.5, tempo=3.0)
         for place, spin in enumerate((None, 0.05)):
@@ -768,18 +748,18 @@ def test_a_pose_is_found_from_orientations() -> None:
 
 
 def test_orientations_alone_tell_the_angles_and_that_nothing_tells_the_place() -> None:
-    person = worn_person(11, 5.0)
+    person = worn_person(11, 3.5)
     segments = ("pelvis", "upper_trunk", "head", *FOREARMS, "upper_arm_left", "upper_arm_right")
     estimator = ExtendedKalmanFilter(PERFECT)
     events = in_order(*(Source(segment, stated=1e-3).measure(person) for segment in segments))
     errors = []
     for each in events:
         assert isinstance(each, SegmentOrientation)
-        if estimator.take_orientation(each) and each.stamp_ns > START_NS + 3 * NANOSECONDS:
+        if estimator.take_orientation(each) and each.stamp_ns > START_NS + 2 * NANOSECONDS:
             estimate = known(estimator)
             errors.append(MODEL.difference(estimate.q, person.at(estimate.stamp_ns)))
     arms = [k for k, name in enumerate(NAMES) if name.startswith(("elbow", "forearm"))]
-    assert len(errors) > 300
+    assert len(errors) > 200
     assert rms(np.array(errors)[:, arms]) < 3.0
     estimate = known(estimator)
     assert (np.sqrt(estimate.covariance.diagonal()[:3]) > 50.0).all()

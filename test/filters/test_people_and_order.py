@@ -28,11 +28,12 @@ from body_tracking.simulation.random_people import (
     observe,
     truth_of,
 )
+from draws import some
 
 SENSORS = ("kinect1", "kinect2")
 DELAYS = 0.02, 0.045
 """Seconds from capture to delivery."""
-SECONDS = 2.0
+SECONDS = 1.5
 
 Event = tuple[int, str, Skeleton]
 Staged = tuple[PersonFilter, list[tuple[str, int]], list[Skeleton]]
@@ -102,7 +103,7 @@ def never_predicting(events: list[Event]) -> Staged:
 def test_frames_wait_for_older_ones_and_the_outcome_is_that_of_going_back(events: list[Event], prompt: Staged) -> None:
     waiting, _, ordered = prompt
     hasty, _, early = staged(events, order_wait=0.0)
-    assert waiting.counters["late_frames"] <= 2 and hasty.counters["late_frames"] > 30
+    assert waiting.counters["late_frames"] <= 2 and hasty.counters["late_frames"] > 20
     assert waiting.counters["frames"] == hasty.counters["frames"] > len(events) - 2 * len(SENSORS) * 4
     stamps = [skeleton.stamp_ns for skeleton in ordered]
     assert stamps == sorted(set(stamps))
@@ -110,7 +111,7 @@ def test_frames_wait_for_older_ones_and_the_outcome_is_that_of_going_back(events
     assert ordered[-1].stamp_ns == early[-1].stamp_ns
 
 
-@pytest.mark.parametrize("busy", [0.03, 0.08, 0.15])
+@pytest.mark.parametrize("busy", some([0.15, 0.03]))
 def test_a_busy_filter_takes_queued_frames_in_the_order_of_their_stamps(
     events: list[Event], never_predicting: Staged, busy: float
 ) -> None:
@@ -124,7 +125,7 @@ def test_a_busy_filter_takes_queued_frames_in_the_order_of_their_stamps(
     assert_allclose(together[-1].positions, ordered[-1].positions, rtol=0.0, atol=1e-6)
 
 
-@pytest.mark.parametrize("busy", [0.0, 0.002])
+@pytest.mark.parametrize("busy", some([0.002, 0.0]))
 def test_a_burst_after_a_stall_goes_back_once_and_its_frames_all_count(
     events: list[Event], prompt: Staged, busy: float
 ) -> None:
@@ -224,7 +225,7 @@ def test_nothing_is_predicted_for_a_time_of_which_frames_wait(events: list[Event
     for settings in ({}, {"order_wait": 0.3}):
         _, published, _ = staged(kept, **settings)
         stamps = [stamp_ns for topic, stamp_ns in published if topic == graph.FILTERED]
-        assert len(stamps) > 50 and stamps == sorted(stamps)
+        assert len(stamps) > 40 and stamps == sorted(stamps)
 
 
 def test_orientations_alone_are_published_at_the_rate_of_predicted_frames() -> None:

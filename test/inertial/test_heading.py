@@ -19,6 +19,7 @@ from body_tracking.inertial.alignment import (
     yaw,
 )
 from body_tracking.inertial.heading import HeadingTracker, bone_of
+from draws import draws
 
 ARM = ("upper_arm_left", "forearm_left")
 SEEDS = st.integers(0, 2**32 - 1)
@@ -101,7 +102,7 @@ def test_a_camera_finds_headings_of_which_nothing_was_known(seed: int) -> None:
 
 def test_what_is_stated_holds_with_a_camera_whose_errors_last_and_headings_that_drift() -> None:
     inside = []
-    for seed in range(4):
+    for seed in range(draws(2, 4)):
         walk = np.radians(0.4)
         wearer = Wearer(seed, 25.0, np.radians(15.0), walk)
         tracker = HeadingTracker(wearer.start, heading_walk=walk)

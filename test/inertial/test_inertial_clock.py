@@ -14,6 +14,7 @@ from body_tracking.calibration.clock_correlation import Series
 from body_tracking.core import so3
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.inertial.clock import clock_offset, turning, turning_of_bone, turning_of_sensor
+from draws import draws
 
 
 def moved(times: FloatArray, seed: int) -> FloatArray:
@@ -48,7 +49,7 @@ def both(seed: int, offset: float, seconds: float = 60.0, noise: float = 0.1, dr
     return result
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=draws(4, 8))
 @given(st.floats(-55.0, 55.0), st.integers(0, 2**31))
 def test_an_offset_of_up_to_a_minute_is_found_or_refused_but_never_wrong(offset: float, seed: int) -> None:
     found = clock_offset(*both(seed, offset, 90.0))
@@ -57,9 +58,10 @@ def test_an_offset_of_up_to_a_minute_is_found_or_refused_but_never_wrong(offset:
 
 
 def test_the_deviation_is_that_of_the_errors_and_most_offsets_are_found() -> None:
-    found = [(clock_offset(*both(seed, 3.7, 60.0, 0.2)), seed) for seed in range(12)]
-    errors = np.array([(each.offset - 3.7) / each.stddev for each, _ in found if each is not None])
-    assert len(errors) >= 10
+    count = draws(8, 12)
+    found = [clock_offset(*both(seed, 3.7, 60.0, 0.2)) for seed in range(count)]
+    errors = np.array([(each.offset - 3.7) / each.stddev for each in found if each is not None])
+    assert len(errors) >= 0.8 * count
     assert (np.abs(errors) < 1.96).mean() >= 0.85
     assert np.sqrt((errors**2).mean()) > 0.2
 

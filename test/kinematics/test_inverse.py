@@ -62,7 +62,7 @@ def distances(q: FloatArray, lengths: FloatArray, points: FloatArray) -> FloatAr
 
 
 def test_points_without_noise_are_reproduced_whatever_the_pose() -> None:
-    _, lengths, points = people(draws(25, 60), 1)
+    _, lengths, points = people(draws(15, 60), 1)
     for length, point in zip(lengths, points, strict=True):
         fit = INVERSE.solve(point, EXACT, length, max_iterations=50)
         assert distances(fit.q, length, point).max() < MILLIMETRE
@@ -92,7 +92,7 @@ def test_the_closed_form_needs_no_lengths_to_point_every_bone_the_right_way() ->
 def test_starts_that_are_somewhat_wrong_lead_to_the_same_fit() -> None:
     """By up to 30 degrees in every angle, and half a metre."""
     rng = np.random.default_rng(3)
-    _, lengths, points = people(draws(15, 40), 3)
+    _, lengths, points = people(draws(8, 40), 3)
     stddev = np.full(points.shape[1], 0.02)
     for length, point in zip(lengths, points, strict=True):
         known = INVERSE.solve(point, stddev, length, max_iterations=100)
@@ -113,7 +113,7 @@ def test_starts_that_are_somewhat_wrong_lead_to_the_same_fit() -> None:
 )
 def test_missing_points_keep_what_is_seen_right(missing: tuple[Joint, ...], unknown: tuple[str, ...]) -> None:
     """And of an angle that no seen point depends on, only what is known of it before is known."""
-    _, lengths, points = people(draws(12, 30), 4)
+    _, lengths, points = people(draws(6, 30), 4)
     gone = of(*missing)
     for length, point in zip(lengths, points, strict=True):
         fit = INVERSE.solve(np.where(gone[:, None], np.nan, point), EXACT, length, max_iterations=50)
@@ -167,7 +167,7 @@ def test_limits_push_back_softly() -> None:
 def test_the_pull_of_an_outlier_does_not_grow_with_its_distance() -> None:
     """Huber: a point 1 m off bends the pose no more than one 0.5 m off; most poses stay within the noise."""
     rng = np.random.default_rng(7)
-    _, lengths, points = people(draws(20, 40), 8)
+    _, lengths, points = people(draws(10, 40), 8)
     noise, count = 0.01, points.shape[1]
     stddev = np.full(count, noise)
     errors = []
@@ -233,7 +233,7 @@ def test_a_hand_turned_over_moves_the_thumb_alone() -> None:
 def test_a_bent_hand_is_found_in_the_likeliest_pose(noise: float) -> None:
     """Whether it is sought from the points alone or from the pose with the hand turned over."""
     rng = np.random.default_rng(12)
-    q, lengths, _ = people(20, 12)
+    q, lengths, _ = people(draws(10, 20), 12)
     right = 0
     stddev = np.full(len(MODEL.joints), noise)
     for number, (one, length) in enumerate(zip(with_bent_wrists(q, 12), lengths, strict=True)):

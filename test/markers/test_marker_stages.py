@@ -26,7 +26,7 @@ from body_tracking.pipeline.offline import OfflineRunner
 from body_tracking.recording.rosbag2 import BAG_WIRE, deserialize
 from body_tracking.simulation.marker_scene import DIAMETER, MarkerScene, marker_scene
 
-RATE, FRAMES = 30.0, 12
+RATE, FRAMES = 30.0, 8
 START_NS = 1_750_000_000 * NANOSECONDS
 JOINTS = (
     JointDescription("shoulder", "shoulder", "upper_arm", JointKind.BALL),

@@ -19,7 +19,7 @@ def sets(cameras: int = 2) -> FrameSets[int]:
 
 @given(st.data(), st.integers(2, 4))
 def test_every_set_is_complete_and_in_order_where_cameras_send_in_order(data: st.DataObject, cameras: int) -> None:
-    count, waiting = 12, sets(cameras)
+    count, waiting = 6, sets(cameras)
     left, found = {f"camera{k}": list(range(count)) for k in range(cameras)}, []
     while any(left.values()):
         camera = data.draw(st.sampled_from(sorted(name for name, frames in left.items() if frames)))

@@ -41,7 +41,7 @@ def error(target: Target, true: FloatArray) -> FloatArray:
 @pytest.mark.parametrize("stated", [True, False])
 def test_covariance_of_a_calibrated_target_is_true(stated: bool) -> None:
     """With hidden balls, and outlier views, which are dropped."""
-    count = draws(8, 100)
+    count = draws(5, 100)
     nees = np.empty(count)
     for seed in range(count):
         rng = np.random.default_rng([seed, 41])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import cv2
@@ -159,9 +158,9 @@ def test_the_sensitivity_is_the_derivative_of_triangulated_points(count: int) ->
 
 
 def _least_squares(cameras: Rig, pixels: FloatArray, start: FloatArray) -> FloatArray:
-    """(n, 3) points by the pixels (n, c, 2), by Gauss-Newton with numeric derivatives."""
+    """(n, 3) points by the pixels (n, c, 2), by Gauss-Newton with numeric derivatives; the start is near."""
     points = np.array(start)
-    for _ in range(5):
+    for _ in range(2):
         missed = (pixels - cameras.project(points).transpose(1, 0, 2)).reshape(len(points), -1)
         jacobian = np.stack(
             [
@@ -226,19 +225,6 @@ def test_bad_balls_are_named() -> None:
         sensitivity(truth, places(rng, 1), np.array([[True, False]]))
     with pytest.raises(TriangulationError, match="behind camera a"):
         sensitivity(truth, -places(rng, 1))
-
-
-def test_fifteen_balls_in_two_cameras_take_less_than_a_millisecond() -> None:
-    truth, rng = rig(), np.random.default_rng(1)
-    balls, _ = images(truth, [places(rng)] * 2, rng)
-    times = []
-    for _ in range(20):
-        start = time.process_time()
-        for _ in range(10):
-            triangulate(truth, balls)
-        times.append((time.process_time() - start) / 10)
-    print(f"15 balls, 2 cameras: {min(times) * 1e3:.2f} ms of CPU")
-    assert min(times) < 2e-3  # 0.5 ms where nothing else runs
 
 
 @pytest.mark.filterwarnings("error")

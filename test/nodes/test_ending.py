@@ -16,6 +16,7 @@ pytest.importorskip("rclpy", reason="ROS is not installed")
 from running import Running, environment
 
 from body_tracking.core.signals import signals_held
+from draws import some
 
 NODES = ("calibration", "joint_angles", "skeleton_filter", "fusion")
 
@@ -40,7 +41,7 @@ def said(folder: Path) -> dict[str, str]:
     return {name: text for name, text in texts.items() if any("[INFO]" not in line for line in text.splitlines())}
 
 
-@pytest.mark.parametrize("after", [0.0, 0.05, 0.3, 0.7, 1.2, 2.0])
+@pytest.mark.parametrize("after", some([0.05, 0.0, 0.3, 0.7, 1.2, 2.0], 3))
 def test_starting_node_ends_at_once(started: list[subprocess.Popen[bytes]], tmp_path: Path, after: float) -> None:
     time.sleep(after)
     for process in started:

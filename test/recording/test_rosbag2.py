@@ -52,7 +52,7 @@ def rosbags_read(path: Path) -> list[Stored]:
 # --- round trips
 
 
-@settings(max_examples=draws(20, 40), deadline=None)
+@settings(max_examples=draws(12, 40))
 @given(contents, st.sampled_from(["zstd", "lz4", "none"]), st.sampled_from([100, 10_000]))
 def test_messages_are_read_in_the_order_of_log_times(drawn, compression, chunk_bytes):
     stored = [(topic, serialize(message(topic, text, number)), at) for topic, text, number, at in drawn]

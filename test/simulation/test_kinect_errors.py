@@ -222,7 +222,7 @@ def test_the_bias_returns_with_the_pose_and_is_of_the_stated_size() -> None:
     truth = np.concatenate([here, away, here])
     errors, unit = only(bias=0.01), []
     rng = np.random.default_rng(1)
-    for _ in range(300):
+    for _ in range(150):
         misreading = Misreading.draw(rng)
         error = see(errors, truth, misreading=misreading, capsules=THIN)[0] - in_sight(truth)
         assert np.allclose(error[0, TRUNK], error[-1, TRUNK])

@@ -45,7 +45,7 @@ def test_every_angle_stays_inside_its_range(seed: int) -> None:
 
 def test_together_people_use_most_of_every_range() -> None:
     ranges = Ranges(MODEL)
-    values = np.concatenate([ranges.soft_coordinates(someone(seed, 20.0).q).values for seed in range(30)])
+    values = np.concatenate([ranges.soft_coordinates(someone(seed, 20.0).q).values for seed in range(20)])
     used = (values.max(axis=0) - values.min(axis=0)) / (ranges.high - ranges.low)
     assert used.min() > 0.6
 
@@ -76,7 +76,7 @@ def test_people_move_like_people_and_rest_between() -> None:
 def test_the_twist_is_shared_by_both_joints_of_the_trunk() -> None:
     scalars = [MODEL.coordinate_names[v] for v in MODEL.scalar_v]
     lumbar, thoracic = (MODEL.scalar_q[scalars.index(name)] for name in ("lumbar_axial", "thoracic_axial"))
-    q = np.concatenate([someone(seed, 20.0).q for seed in range(40)])
+    q = np.concatenate([someone(seed, 20.0).q for seed in range(20)])
     assert np.corrcoef(q[:, lumbar], q[:, thoracic])[0, 1] > 0.7
     assert q[:, thoracic].std() > 1.5 * q[:, lumbar].std()
 
