@@ -52,6 +52,7 @@ def test_a_recording_is_aligned_with_itself_by_no_warp() -> None:
     assert warp.rates == pytest.approx(1.0, abs=0.01)
 
 
+@pytest.mark.slow
 def test_bias_and_scale_of_a_feature_are_no_differences_of_time() -> None:
     features = movement(0.3 + TIMES)
     plain = time_warp.estimate_warp(TIMES, features, REFERENCE_TIMES, REFERENCE)
@@ -60,6 +61,7 @@ def test_bias_and_scale_of_a_feature_are_no_differences_of_time() -> None:
     assert changed(TIMES) == pytest.approx(plain(TIMES), abs=1e-3, nan_ok=True)
 
 
+@pytest.mark.slow
 def test_noise_is_not_taken_for_time() -> None:
     # dynamic time warping shows this noise smaller than it is, by 22 % with all features and 42 % with the first alone
     generator = np.random.default_rng(5)
@@ -71,6 +73,7 @@ def test_noise_is_not_taken_for_time() -> None:
     assert measured == pytest.approx(noise[:, 0].std(), rel=0.15)
 
 
+@pytest.mark.slow
 def test_a_cycle_that_was_cut_elsewhere_is_continued() -> None:
     cycle = np.arange(0.0, 2.0, 0.01)
 
@@ -84,6 +87,7 @@ def test_a_cycle_that_was_cut_elsewhere_is_continued() -> None:
     assert np.isfinite(warp(TIMES)).all()
 
 
+@pytest.mark.slow
 def test_the_opposite_movement_explains_nothing() -> None:
     raising = np.linspace(0.0, 1.0, 60)[:, None]
     times = np.arange(60) / 30.0

@@ -26,6 +26,7 @@ from body_tracking.inertial.simulated_errors import (
 from body_tracking.inertial.surroundings import Iron, Surroundings
 from body_tracking.kinematics.trajectories import minimum_jerk
 from body_tracking.simulation.random_people import MODEL, RandomMotion, RandomPerson
+from draws import some
 
 UP = np.array([0.0, 0.0, 1.0])
 AT_ORIGIN = Mounting(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
