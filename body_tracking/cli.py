@@ -28,9 +28,9 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
     """The parser of one subcommand; for an unknown or no command, one with the names of all."""
     top = argparse.ArgumentParser(
         prog="body_tracking",
-        description="Joint angles with honest uncertainty from several sensors: recordings in, the live graph, "
-        "the same chain offline.",
-        epilog="body_tracking COMMAND --help says more of each.",
+        description="Joint angles with standard deviations from several sensors: the live graph, "
+        "and the same chain offline over recordings.",
+        epilog="body_tracking COMMAND --help prints the options of a command.",
     )
     top.add_argument("--version", action="version", version=f"body_tracking {version('body_tracking')}")
     subparsers = top.add_subparsers(title="commands", metavar="COMMAND", required=True)

@@ -12,8 +12,8 @@ from body_tracking.systems import SYSTEMS
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the subcommand ``compile``."""
     text = (
-        "Compiles the loops over pixels and candidates, and keeps the machine code beside the package or in the user's "
-        "cache folder. A node would do so when it starts, and take half a minute."
+        "Compiles the loops of the image processing, and keeps the machine code beside the package or in the user's "
+        "cache folder. Otherwise the first node that needs them takes half a minute to start."
     )
     subparsers.add_parser("compile", help=text, description=text).set_defaults(run=run)
 

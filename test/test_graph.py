@@ -179,7 +179,7 @@ def test_robot_and_viewers_subscribe_to_every_sensor() -> None:
 def test_convention_follows_the_robot() -> None:
     file = ROOT / "config" / "robots" / "iiwa7.yaml"
     assert convention_of(file, "") == convention_of(file, "auto") == "isb"
-    with pytest.raises(graph.GraphError, match=r"model: .*iiwa7\.yaml is about angles of the convention isb"):
+    with pytest.raises(graph.GraphError, match=r"model: .*iiwa7\.yaml needs angles of the convention isb"):
         convention_of(file, "model")
     with pytest.raises(BodyTrackingError, match="cannot be read"):
         convention_of(ROOT / "nowhere.yaml", "")

@@ -100,7 +100,7 @@ class CalibrationParameters:
     method: str = field(
         default="robust",
         metadata={
-            "doc": "thesis: one still pose, averaged over 50 frames; robust: start from it, then refine over movement",
+            "doc": "thesis: one still pose, averaged over 50 frames; robust: refined while the person moves",
             "choices": ("robust", "thesis"),
         },
     )
@@ -112,8 +112,10 @@ class CalibrationParameters:
         0.0, "roll of the reference sensor about its view, clockwise from behind", "rad", -3.2, 3.2
     )
     history: float = number_field(30.0, "raw frames kept for finding the clock offset", "s", 5.0, 600.0)
-    activation_delay: float = number_field(0.5, "a new estimate holds from this long after it was made", "s", 0.0, 10.0)
-    max_rotation_stddev: float = number_field(0.05, "warn while a pose is known less well than this", "rad", 0.001, 3.2)
+    activation_delay: float = number_field(0.5, "delay after which a new estimate comes into force", "s", 0.0, 10.0)
+    max_rotation_stddev: float = number_field(
+        0.05, "warn while the standard deviation of a sensor's rotation exceeds this", "rad", 0.001, 3.2
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -284,7 +286,7 @@ class OnlineCalibration:
             return self._advance(skeleton.stamp_ns)
         other = self._sensors.get(sensor)
         if other is not None and not other.track.push(skeleton, received_ns):
-            self.events.append(f"the clock of {sensor} went back: looking for its offset again")
+            self.events.append(f"the clock of {sensor} went back: estimating its offset again")
             other.track = _Track()
             other.loaded = None
             other.forget()
@@ -358,7 +360,7 @@ class OnlineCalibration:
         assert self._anchor is not None
         if other.rotation is None or abs(other.clock.offset_ns_at(self._anchor) / NANOSECONDS - guess) > CLOCK_STEP:
             if other.rotation is not None:
-                self.events.append(f"the clock of {name} is not the one that was calibrated: looking for its offset")
+                self.events.append(f"the clock of {name} is not the one that was calibrated: estimating its offset")
                 self._changed = True
             offset = GUESS_GRID * round(guess / GUESS_GRID)
             other.clock = ClockModel(round(offset * NANOSECONDS), 0.0, self._anchor)
@@ -455,7 +457,7 @@ class OnlineCalibration:
             # Without a still pose the movement itself is a start.
             start = registration(other.pairs.pairs())
             if start is not None:
-                self.events.append(f"{name}: calibrated from movement, no still pose was seen")
+                self.events.append(f"{name}: calibrated from motion without a still pose")
                 other.started = start
 
     @staticmethod
@@ -718,7 +720,7 @@ class OnlineCalibration:
     # --- services
 
     def start(self) -> str:
-        """Estimate anew from the next still pose; the calibration so far holds until then."""
+        """Estimate anew from the next still pose; the present calibration stays in force until then."""
         for other in self._sensors.values():
             other.loaded = None
             other.forget()

@@ -78,7 +78,7 @@ class CalibrationStage(Stage):
         self.services = {graph.START_SERVICE: self.calibration.start, graph.RESET_SERVICE: self.calibration.reset}
 
     def change(self, values: Mapping[str, Value]) -> None:
-        """From the next frame on; what was estimated stays."""
+        """Apply from the next frame on; the estimate is kept."""
         self.calibration.parameters = CalibrationParameters(**fields_of(CalibrationParameters, values))
         self.values = values
 

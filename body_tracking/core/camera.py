@@ -54,7 +54,9 @@ class Camera:
     def __post_init__(self) -> None:
         where = f"camera {self.frame_id or '(no frame_id)'}"
         if not self.frame_id or self.width < 1 or self.height < 1:
-            raise CameraError(f"{where}: {self.width} x {self.height} pixels; a frame and pixels are needed")
+            raise CameraError(
+                f"{where}: {self.width} x {self.height} pixels; a frame id and a positive size are needed"
+            )
         if self.model not in MODELS:
             raise CameraError(f"{where}: distortion model {self.model!r}, expected one of {', '.join(MODELS)}")
         if self.matrix.shape != (3, 3) or self.distortion.shape != (MODELS[self.model],):

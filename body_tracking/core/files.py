@@ -140,7 +140,7 @@ def _check(text: str, loader: Any, aliases: bool) -> None:
             if not aliases:
                 raise FileLimitError(f"is not read (an alias {where})")
             if event.anchor not in sizes:
-                raise FileLimitError(f"is not read (an alias of what it stands in, or of nothing, {where})")
+                raise FileLimitError(f"is not read (an alias of its own container, or of no anchor, {where})")
             nodes += sizes[event.anchor]
         elif isinstance(event, _OPENING):
             open_at.append((event.anchor, nodes))

@@ -74,7 +74,7 @@ class JointSet:
         parents: the number of each joint's parent; -1 at the root.
 
     Raises:
-        SkeletonError: a name twice, or a parent that is none.
+        SkeletonError: a repeated name, or an invalid parent.
     """
 
     name: str

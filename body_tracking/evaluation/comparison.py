@@ -185,8 +185,8 @@ def evaluate(
     delay = find_delay(whole, curve, WINDOW, around)
     if np.isnan(delay) and own_clock:
         raise EvaluationError(
-            f"{estimate.source} and {truth.source} do not show the same movement, or hardly any: nothing tells which "
-            "of their frames belong together"
+            f"{estimate.source} and {truth.source} do not show the same movement, or hardly any: their frames cannot "
+            "be matched"
         )
     if np.isnan(delay):
         notes.append(f"no delay within {WINDOW:g} s could be found (still, or another clock?): aligned in space only")

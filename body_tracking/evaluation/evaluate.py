@@ -55,37 +55,43 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="a bag with /ground_truth/skeleton (default: EST itself), a C3D file with Plug-in Gait's markers, or a "
         "recording of the marker system, with poses of targets",
     )
-    parser.add_argument("--topic", help="skeletons to judge (default: /filtered/skeleton, else /fused/skeleton)")
-    parser.add_argument("--body", metavar="ID", help="whose angles (default: the first in the recording)")
+    parser.add_argument("--topic", help="the skeletons to compare (default: /filtered/skeleton, else /fused/skeleton)")
+    parser.add_argument(
+        "--body", metavar="ID", help="id of the person whose angles are compared (default: the first in the recording)"
+    )
     parser.add_argument(
         "--own-clock",
         action="store_true",
-        help="clock and frame of TRUTH are its own, as those of a C3D file always are: find the shift by the movement, "
-        "and compare aligned only",
+        help="TRUTH has another clock and frame, as a C3D file always has: find the time shift by the motion, and "
+        "compare after alignment only",
     )
-    parser.add_argument("--subject", metavar="NAME", help="whose markers, where a C3D file holds several people's")
+    parser.add_argument("--subject", metavar="NAME", help="the subject, if a C3D file has the markers of several")
     parser.add_argument(
-        "--measurements", type=Path, metavar="FILE", help="the subject's, from Vicon (default: those in the C3D file)"
+        "--measurements",
+        type=Path,
+        metavar="FILE",
+        help="body measurements of the subject, from Vicon (default: those in the C3D file)",
     )
     parser.add_argument(
         "--mounted",
         action="append",
         default=[],
         metavar="TARGET=SEGMENT",
-        help="of a recording of the marker system: the segment that carries a target; may be repeated (default: the "
+        help="for a recording of the marker system: the segment that carries a target; may be repeated (default: the "
         "segment of the target's name)",
     )
     parser.add_argument(
         "--mountings",
         type=Path,
         metavar="FILE",
-        help="likewise: how targets are mounted, as --save-mountings wrote it; constant offsets of EST show only so",
+        help="likewise: mountings of the targets, written by --save-mountings; without them constant offsets of EST "
+        "do not show",
     )
     parser.add_argument(
-        "--save-mountings", type=Path, metavar="FILE", help="likewise: write how the targets are mounted by EST"
+        "--save-mountings", type=Path, metavar="FILE", help="likewise: write the mountings of the targets that fit EST"
     )
     parser.add_argument("--html", type=Path, metavar="FILE", help="write a page with tables and pictures")
-    parser.add_argument("--json", action="store_true", help="print everything as JSON instead of tables")
+    parser.add_argument("--json", action="store_true", help="print all results as JSON instead of tables")
     parser.set_defaults(run=run)
 
 

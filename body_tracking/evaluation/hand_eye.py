@@ -6,8 +6,8 @@ measured one B (target to rig), the mounting X (target to segment) and the rig's
     A_t(s) X_t = Z B_t(s + offset + drift (s - middle))                                                             (1)
 
 at every time s of the estimate: robot-world/hand-eye calibration (Dornaika and Horaud 1998) with one Z for all targets.
-Only orientations are used: places say nothing about angles until the segment lengths and joint centres of the estimate
-are known, which are themselves to be judged.
+Only orientations are used: positions give no angles without the segment lengths and joint centres of the estimate,
+which are themselves under test.
 
 **Start.** In closed form (Shah, J. Mechanisms Robotics 5 (2013) 031007): ``tr(Z^T A X B^T)``, summed over all times,
 is bilinear in vec Z and vec X, so that the largest singular vector of the stacked sums of Kronecker products gives Z.
@@ -133,8 +133,8 @@ class HandEye:
         clock: (2,) offset in seconds at ``middle``, and drift: target's clock minus that of the estimate.
         middle: s in the estimate's time.
         covariance: (3 k + 5, 3 k + 5): of ``w`` per mounting, in its segment's frame, such that the true one is
-            ``exp(w) @ mounting``; of the world likewise, in the world's frame; of the clock. Rows and columns of what
-            was not fitted are zero.
+            ``exp(w) @ mounting``; of the world likewise, in the world's frame; of the clock. Rows and columns of
+            unfitted parameters are zero.
         scatter: (k, 3, 3) square radians: of the estimate's errors, in the segment's frame.
         residuals: (n, k, 3) radians, eq. 2; NaN where a segment or its target is unknown.
         motion: (3,) radians RMS of all targets about the principal axes of their motion in the rig, largest first.

@@ -124,7 +124,7 @@ class Measurements:
         )
 
     def completed(self, markers: Mapping[str, FloatArray]) -> tuple[Measurements, tuple[str, ...]]:
-        """The same with estimates (module docstring) for what is unknown, and the names of what was estimated.
+        """The same with estimates (module docstring) of unknown measurements, and the names of these.
 
         Leg lengths are not estimated.
 
@@ -285,7 +285,7 @@ def chord(distance: FloatArray | float, joint: FloatArray, marker: FloatArray, t
 
 
 def joint_centres(markers: Mapping[str, FloatArray], measurements: Measurements) -> FloatArray:
-    """Joint centres as the module's docstring tells; the truth of Jatesiktat et al. (2018), section IV-A.
+    """Joint centres as described in the module's docstring; the truth of Jatesiktat et al. (2018), section IV-A.
 
     Args:
         markers: (n, 3) metres each; all of :data:`MARKERS`, NaN where unknown.

@@ -76,8 +76,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("bag", type=Path, help="a bag folder with joint angles, such as the output of replay")
     parser.add_argument("-o", "--output", type=Path, metavar="PNG", help="draw a picture into this file")
-    parser.add_argument("--body", metavar="ID", help="of which person (default: the first in the recording)")
-    parser.add_argument("--truth", type=Path, metavar="BAG", help="the bag that holds the truth (default: the same)")
+    parser.add_argument("--body", metavar="ID", help="id of the person (default: the first in the recording)")
+    parser.add_argument("--truth", type=Path, metavar="BAG", help="the bag with the truth (default: the same)")
     parser.set_defaults(run=run)
 
 

@@ -9,6 +9,6 @@ SYSTEM = System(
     order=8,
     commands=(
         Command("show", "body_tracking.evaluation.show", "show the joint angles in a recording"),
-        Command("evaluate", "body_tracking.evaluation.evaluate", "compare what was estimated with the truth"),
+        Command("evaluate", "body_tracking.evaluation.evaluate", "compare a recording's estimates with the truth"),
     ),
 )

@@ -128,8 +128,8 @@ class LinearKalmanParameters:
     )
     measurement_noise_scale: float = number_field(
         1.0,
-        "where the skeleton brings no covariance: factor on the standard deviation per joint, tracking "
-        "state and distance of body_tracking.core.measurement",
+        "for skeletons without covariance: factor on each joint's standard deviation, which follows from tracking "
+        "state and distance (body_tracking.core.measurement)",
         "",
         0.01,
         100.0,

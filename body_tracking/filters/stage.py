@@ -39,11 +39,11 @@ from body_tracking.pipeline.shared import (
 )
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
 
-FILTER = Parameter("filter", DEFAULT_FILTER, "which filter", choices=FILTERS, live=True)
+FILTER = Parameter("filter", DEFAULT_FILTER, "the filter", choices=FILTERS, live=True)
 INPUT = Parameter(
     "input",
     graph.AUTO,
-    "what is filtered: fused skeletons, or every sensor's frames at their own time; auto: sensors for ekf, else fused",
+    "the input: fused skeletons, or every sensor's frames at their own times; auto: sensors for ekf, else fused",
     choices=(graph.AUTO, graph.FUSED_INPUT, graph.SENSORS_INPUT),
 )
 PREDICT_AFTER = Parameter(
@@ -58,8 +58,8 @@ PREDICT_AFTER = Parameter(
 ORDER_WAIT = Parameter(
     "order_wait",
     DEFAULT_ORDER_WAIT,
-    "sensors' frames: one waits at most this long for another sensor's older one that is due; 0 for the least delay, "
-    "with frames that come late then taken into account by going back",
+    "input sensors: the longest wait of a frame for an older one of another sensor that is due; 0 for the least "
+    "delay: late frames are then inserted and later updates repeated",
     unit="s",
     min=0.0,
     max=1.0,
@@ -68,14 +68,14 @@ ORDER_WAIT = Parameter(
 KINECT_ARMS = Parameter(
     "kinect_arms",
     True,
-    "correct the directions of the arms by what a Kinect v2 has wrong against Vicon; false for other sensors. The "
-    "thesis's filters never do",
+    "correct the directions of the arms by the errors of a Kinect v2 against Vicon; false for other sensors. No "
+    "effect on the thesis's filters",
     live=True,
 )
 ORIENTATIONS = Parameter(
     "orientations",
     (),
-    "ekf: segments whose orientations by inertial sensors it takes, from /imu/<segment>/orientation",
+    "ekf: segments with inertial sensors, whose orientations come from /imu/<segment>/orientation",
 )
 
 
@@ -241,7 +241,7 @@ class FilterStage(Stage):
         counters = self.filter.counters
         before, self._t_poses = self._t_poses, counters.get("t_poses", 0)
         if self._t_poses > before:
-            self.events.append("joint centres of this person learnt from a T-pose: angles are more accurate now")
+            self.events.append("joint centres of this person estimated from a T-pose: angles are more accurate now")
         return 0, str(self.values["filter"]), {"tracked": ", ".join(self.filter.tracked), **counters}
 
     @property

@@ -51,7 +51,7 @@ SYSTEM = System(
         Option(
             "filter",
             "",
-            "which filter; overrides the parameters file",
+            "the filter; overrides the parameters file",
             choices=_filters,
             parameter=("skeleton_filter", "filter"),
         ),
@@ -63,8 +63,8 @@ SYSTEM = System(
             POINT_CLOUD,
             graph.SKELETON,
             "skeleton_filter",
-            "the same, filtered; in addition velocity `vx vy vz`; with `ekf` one per sensor's frame, and predicted "
-            "ones while nothing arrives",
+            "the filtered person, as `/fused/skeleton`, and velocity `vx vy vz`; with `ekf` one message per sensor's "
+            "frame, and predicted ones while nothing arrives",
         ),
         TopicSpec(
             graph.MODEL_STATE,
@@ -79,7 +79,8 @@ SYSTEM = System(
             JOINT_STATE,
             graph.SKELETON,
             "skeleton_filter",
-            "`ekf`: the standard deviation of each; of a rotation, that of a small one more in the segment's own frame",
+            "`ekf`: the standard deviation of each; of a rotation vector, that of a small further rotation in the "
+            "segment's own frame",
         ),
         TopicSpec(
             graph.MODEL_COVARIANCE,
@@ -94,7 +95,7 @@ SYSTEM = System(
             JOINT_STATE,
             graph.SKELETON,
             "skeleton_filter",
-            "`ekf`, of each of several people (`subject: all`) what `/filtered/model_state` is of one; so are "
+            "`ekf`, with `subject: all`: as `/filtered/model_state`, of each person; likewise "
             "`.../model_state_stddev` and `.../model_covariance`",
         ),
         TopicSpec(

@@ -61,8 +61,8 @@ class FusionParameters:
     method: str = field(
         default="covariance",
         metadata={
-            "doc": "covariance: weighted by each joint's uncertainty, gated, turned bodies repaired; thesis_text: only "
-            "Tracked joints where any sensor tracks them; thesis_formula: in proportion to the tracking states",
+            "doc": "covariance: inverse variances, with a gate and repair of swapped sides; thesis_text: only tracked "
+            "joints where any sensor tracks them; thesis_formula: in proportion to the tracking states",
             "choices": ("covariance", "thesis_text", "thesis_formula"),
         },
     )

@@ -25,7 +25,7 @@ class TrackingParameters:
 
     pose: str = _choice(
         AUTO,
-        "in which pose the sensors are aligned with the body: T-pose with palms down, or arms hanging with thumbs "
+        "pose in which the sensors are aligned with the body: T-pose with palms down, or arms hanging with thumbs "
         "forward; auto: the first of the two that is held for a second",
         AUTO,
         T_POSE,
@@ -33,18 +33,19 @@ class TrackingParameters:
     )
     camera: bool = field(
         default=True,
-        metadata={"doc": "take headings, slips and clocks from a camera's skeletons; false: inertial sensors alone"},
+        metadata={
+            "doc": "estimate headings, slips and clocks from the cameras' skeletons; false: from inertial sensors alone"
+        },
     )
     clock: str = _choice(
         OWN,
-        "own: each sensor has a clock of its own; shared: all have the same; reference: stamps are as those of world",
+        "own: each sensor has its own clock; shared: all have the same clock; reference: all have the clock of the "
+        "reference sensor",
         OWN,
         SHARED,
         REFERENCE,
     )
-    magnetometer: bool = field(
-        default=True, metadata={"doc": "use magnetic fields, where there are any and while they are undisturbed"}
-    )
+    magnetometer: bool = field(default=True, metadata={"doc": "use magnetic fields while they are undisturbed"})
     rate: float = number_field(30.0, "skeletons per second", "Hz", 1.0, 200.0)
     orientation_rate: float = number_field(30.0, "orientations of each segment per second at most", "Hz", 1.0, 1000.0)
     largest_stddev: float = number_field(
@@ -55,10 +56,13 @@ class TrackingParameters:
     )
     pose_stddev: float = number_field(
         0.105,
-        "standard deviation of the person's joints from the pose, per axis; more for a person who cannot hold it",
+        "standard deviation of the person's joint angles from the ideal pose, per axis; larger for a person who "
+        "cannot hold it",
         "rad",
         0.001,
         1.0,
     )
     silent_after: float = number_field(0.5, "a sensor without a reading for longer is silent", "s", 0.05, 60.0)
-    stature: float = number_field(1.75, "of the person; used until a camera has measured the segments", "m", 0.5, 2.5)
+    stature: float = number_field(
+        1.75, "the person's height; used until a camera has measured the segments", "m", 0.5, 2.5
+    )

@@ -30,14 +30,14 @@ from body_tracking.pipeline.stage import Now, Output, Port, Stage
 SEGMENTS = Parameter(
     "segments",
     (),
-    "segments with an inertial sensor, each as SEGMENT (topics /SEGMENT/imu/data, data_raw and mag), SEGMENT:NAME (the "
-    "same of another name) or SEGMENT:/TOPIC",
+    "segments with an inertial sensor, each as SEGMENT (topics /SEGMENT/imu/data, data_raw and mag), SEGMENT:NAME "
+    "(topics /NAME/imu/...) or SEGMENT:/TOPIC",
 )
 MOUNTINGS = Parameter(
     "mountings",
     (),
-    "SEGMENT:AXES of sensors that are not worn as usual: where their x and z point on the hanging arm or the upright "
-    "trunk of a person who faces x with y to the left, as in forearm_left:-z+y",
+    "SEGMENT:AXES of sensors that are not worn as usual: the directions of the sensor's x and z axes with hanging "
+    "arms and upright trunk, where the person faces +x and +y is to the left, as in forearm_left:-z+y",
 )
 _SETTABLE = ("pose", "camera", "clock", "magnetometer", "rate", "pose_stddev", "stature")
 IMU_PARAMETERS: Final = (SEGMENTS, MOUNTINGS, *parameters_from(TrackingParameters, only=_SETTABLE))

@@ -41,7 +41,7 @@ SYSTEM = System(
         Option(
             "imus",
             (),
-            "a segment with an inertial sensor, as the parameter segments of imu_skeleton lists them",
+            "a segment with an inertial sensor, in the form of the parameter segments of imu_skeleton; may be repeated",
             "SEGMENT[:NAME]",
             parameter=("imu_skeleton", "segments"),
             example=graph.EXAMPLE_IMUS,
@@ -54,18 +54,20 @@ SYSTEM = System(
             graph.SKELETON,
             "imu_skeleton",
             "the body that fits the orientations of inertial sensors, in `world`, with covariance as "
-            "`/fused/skeleton`; joints that these do not place are inferred",
+            "`/fused/skeleton`; joints that the sensors do not place are inferred",
         ),
         TopicSpec(
             graph.orientation_topic("<segment>"),
             IMU,
             graph.SKELETON,
             "imu_skeleton",
-            "the orientation of a segment in `world` with its covariance there, and its angular velocity about its own "
-            "axes, by an inertial sensor",
+            "the orientation of a segment with an inertial sensor in `world`, with covariance in `world`, and its "
+            "angular velocity about its own axes",
         ),
     ),
     services=(
-        Service(graph.ALIGN_SERVICE, "imu_skeleton", "align the inertial sensors anew in the next pose that is held"),
+        Service(
+            graph.ALIGN_SERVICE, "imu_skeleton", "align the inertial sensors anew in the next pose that is held still"
+        ),
     ),
 )

@@ -59,7 +59,9 @@ class SensorClocks:
 
     @property
     def found(self) -> dict[str, float]:
-        """Seconds by which stamps are later than the times of receipt say, for the sensors corrected by motion."""
+        """Seconds from the stamp expected by the times of receipt to the estimated one, for sensors corrected by
+        motion.
+        """
         return {name: each.offset for name, each in self._transports.items() if each.found}
 
     def take_reading(self, stamp_ns: int, received_ns: int) -> None:

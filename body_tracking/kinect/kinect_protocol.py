@@ -194,7 +194,9 @@ def read_header(packet: bytes) -> Header:
     if magic != MAGIC:
         raise ProtocolError("not ours", "not a packet of this protocol")
     if version != VERSION:
-        raise ProtocolError("version", f"version {version}, expected {VERSION}: sender and receiver are not alike")
+        raise ProtocolError(
+            "version", f"version {version}, expected {VERSION}: sender and receiver have different versions"
+        )
     if kind not in (FRAME, CLOCK_REQUEST, CLOCK_ANSWER):
         raise ProtocolError("kind", f"kind {kind}")
     if size != len(packet) or (kind != FRAME and size != MIN_PACKET):
@@ -211,7 +213,7 @@ def check_signature(packet: bytes, key: bytes) -> None:
         ProtocolError: it is wrong.
     """
     if not hmac.compare_digest(_tag(packet[:-_TAG], key), packet[-_TAG:]):
-        raise ProtocolError("wrong signature", "signed with another key, or changed on its way")
+        raise ProtocolError("wrong signature", "signed with another key, or changed in transit")
 
 
 def read_frame(packet: bytes) -> Frame:

@@ -275,17 +275,17 @@ def parser() -> argparse.ArgumentParser:
     to = f"127.0.0.1:{protocol.DEFAULT_PORT}"
     text = "the computer that runs kinect_skeleton, and its port (default %(default)s)"
     made.add_argument("--to", metavar="HOST:PORT", default=to, help=text)
-    text = "the sensor's name there (default %(default)s)"
+    text = "the sensor's name at the receiver (default %(default)s)"
     made.add_argument("--sensor", default="kinect1", metavar="NAME", help=text)
     made.add_argument("--key-file", metavar="FILE", help="the shared key; not needed for 127.0.0.1")
-    made.add_argument("--make-key", metavar="FILE", help="write a new key into a new file, and end")
+    made.add_argument("--make-key", metavar="FILE", help="write a new key into a new file, and exit")
     replay = made.add_argument_group("a recording in place of the sensor")
     replay.add_argument("--replay", metavar="FILE", help="a bag, a .csv, .csv.gz or .skeleton file")
     text = "the sensor's name in it (default: --sensor)"
     replay.add_argument("--recorded-sensor", default="", metavar="NAME", help=text)
     replay.add_argument("--rate", type=float, default=1.0, metavar="X", help="play it X times as fast (default 1)")
-    replay.add_argument("--loop", action="store_true", help="begin again at its end")
-    text = "wall time, seconds, at which it begins, to keep several in step (default: now)"
+    replay.add_argument("--loop", action="store_true", help="play again from the beginning at its end")
+    text = "wall time in seconds at which it begins; the same for several senders keeps them in step (default: now)"
     replay.add_argument("--start-time", type=float, default=0.0, metavar="S", help=text)
     return made
 

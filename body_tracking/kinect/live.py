@@ -27,34 +27,34 @@ class SourceSettings:
     """Settings for all backends; each uses those that concern it. The fields' metadata describe them."""
 
     sensor: str = described_field(
-        "kinect1", "the sensor's name: its topic is /<sensor>/skeleton, its frame that name too"
+        "kinect1", "the sensor's name, in its topic /<sensor>/skeleton and its frame <sensor>_optical_frame"
     )
     device: str = described_field("", "network: the sensor's name at kinect_sender; empty for the same name")
     file: str = described_field("", "recording: a .csv, .csv.gz or .skeleton file, or a bag")
     recorded_sensor: str = described_field("", "recording: the sensor's name in the file; empty for the same name")
-    rate: float = number_field(1.0, "recording: seconds of it per second", "", 0.01, 100.0)
-    loop: bool = described_field(False, "recording: begin again at the end; time goes on")
+    rate: float = number_field(1.0, "recording: playback speed, recorded seconds per second", "", 0.01, 100.0)
+    loop: bool = described_field(False, "recording: play again from the beginning at the end; the stamps continue")
     start_time: float = number_field(
         0.0,
-        "recording: wall time at which its first frame (of any sensor in it) plays; 0 for now. With the same time for "
-        "each, several sensors stay in step, and one that is started again goes on where it should be",
+        "recording: wall time at which the recording begins; 0 for now. Nodes with the same value play in step, also "
+        "after a restart",
         "s",
         0.0,
         1e11,
     )
     address: str = described_field(
         "127.0.0.1",
-        "network: the IP address of this computer to listen on, 0.0.0.0 for all; other computers reach no loopback "
-        "address, and any other needs a key",
+        "network: the IP address of this computer to listen on, 0.0.0.0 for all; every address but a loopback one "
+        "needs a key",
     )
     port: int = field(
         default=DEFAULT_PORT,
         metadata={"doc": "network: the UDP port to listen on; one per sensor", "min": 1, "max": 65535},
     )
-    key_file: str = described_field("", "network: the file with the key that kinect_sender was given too")
+    key_file: str = described_field("", "network: file with the key, the same as that of kinect_sender")
     least_delay: float = number_field(
         0.0,
-        "network: least time of the sensor from capture until its frame can be sent, which cannot be measured",
+        "network: the sensor's shortest delay from capture until its frame can be sent, which cannot be measured",
         "s",
         0.0,
         1.0,

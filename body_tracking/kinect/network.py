@@ -118,7 +118,7 @@ class Receiver:
         try:
             header = protocol.read_header(packet)
             if header.kind == protocol.CLOCK_REQUEST:
-                raise ProtocolError("kind", "a clock request, which is not for receivers")
+                raise ProtocolError("kind", "a clock request, which only senders take")
             if header.sensor != self._sensor:
                 raise ProtocolError("another sensor", f"frames of {header.sensor!r}, expected {self._sensor!r}")
             protocol.check_signature(packet, self._key)
@@ -186,7 +186,7 @@ class Receiver:
 
     def _take_answer(self, header: Header, times: ClockTimes, source: Address, now_ns: int) -> None:
         if header.sequence != self._random(header.session, times.asked_ns):
-            raise ProtocolError("unasked", "an answer to a question that this receiver has not asked")
+            raise ProtocolError("unasked", "an answer to no request of this receiver")
         if not 0 <= now_ns - times.asked_ns <= _ANSWER_TIMEOUT_NS:
             raise ProtocolError("late answer", "an answer that took too long")
         session = self._session

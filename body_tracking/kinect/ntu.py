@@ -67,7 +67,7 @@ class NtuRecording:
         self.path = Path(path)
         name = sensor or sensor_of(self.path)
         if name is None:
-            raise NtuError(f"{self.path}: the name does not tell the camera (SsssCcccPpppRrrrAaaa): --sensor NAME")
+            raise NtuError(f"{self.path}: the file name does not give the camera (SsssCcccPpppRrrrAaaa): --sensor NAME")
         self.sensor = check_sensor_name(name)
         self.problems: dict[str, int] = {}
         self.warnings: list[str] = []
@@ -114,7 +114,7 @@ class NtuRecording:
                 counts[EMPTY] += 1
             self.problems = {name: count for name, count in counts.items() if count}
         if any(line.strip() for line in self._lines[self._next :]) and not self.warnings:
-            raise NtuError(f"{self.path}, line {self._next + 1}: goes on after the last of {n_frames} frames")
+            raise NtuError(f"{self.path}, line {self._next + 1}: continues after the last of {n_frames} frames")
         self.progress = 1.0
 
     def _error(self, text: str) -> Exception:

@@ -111,7 +111,7 @@ SYSTEM = System(
         Option(
             "sensors",
             graph.DEFAULT_SENSORS,
-            "names, the reference first, or none (default: those in the bag, else kinect1,kinect2)",
+            "the sensors, the reference first, or none (default: those in the bag, else kinect1,kinect2)",
             "A,B",
         ),
         Option("computed", (), hidden=True),
@@ -119,22 +119,28 @@ SYSTEM = System(
         Option(
             "adapt",
             (),
-            "this sensor's skeletons come from the ROS driver of an Azure Kinect (its body_tracking_data)",
+            "take this sensor's skeletons from the ROS driver of an Azure Kinect (default topic: body_tracking_data)",
             "SENSOR[:/TOPIC]",
         ),
-        Option("calibration", "", "YAML file to load the calibration from, if there, and save to", "FILE", path=True),
-        Option("reliable", False, "transport skeletons reliably: nothing is lost, whatever it takes"),
+        Option(
+            "calibration",
+            "",
+            "YAML file of the calibration: loaded if it exists, saved when the result changes",
+            "FILE",
+            path=True,
+        ),
+        Option("reliable", False, "transport skeletons reliably: nothing is lost, but delays may grow"),
         Option(
             "subject",
             "",
-            "whom to track: one, who is the nearest or is seen first, or all (default: nearest)",
+            "whom to track: the nearest person, the one seen first, or all (default: nearest)",
             choices=_subjects,
             parameter=("skeleton_filter", "subject"),
         ),
         Option(
             "people",
             0,
-            "with --subject all: how many at most (6)",
+            "with --subject all: the largest number of people (default: 6)",
             "N",
             parameter=("skeleton_filter", "people"),
         ),
@@ -145,25 +151,24 @@ SYSTEM = System(
             POINT_CLOUD,
             graph.SKELETON,
             "kinect_skeleton",
-            "what one sensor sees, in `<sensor>_optical_frame`: a point per joint, SDK order; fields "
-            "`x y z` float32, `joint` uint8, `tracking_state` uint8 (0 not tracked, 1 inferred, 2 tracked), `body` "
-            "uint16",
+            "the skeletons of one sensor, in `<sensor>_optical_frame`: a point per joint, SDK order; fields `x y z` "
+            "float32, `joint` uint8, `tracking_state` uint8 (0 not tracked, 1 inferred, 2 tracked), `body` uint16",
         ),
         TopicSpec(
             graph.CALIBRATION,
             TRANSFORM,
             LATCHED,
             "calibration",
-            "the pose of each sensor's optical frame in `world`, one message per sensor; holds from its stamp on (0: "
-            "always), by the stamps of the reference sensor",
+            "the pose of each sensor's optical frame in `world`, one message per sensor; in force from its stamp on "
+            "(0: always), in the time of the reference sensor",
         ),
         TopicSpec(
             graph.CALIBRATION_CLOCK,
             TIME_REFERENCE,
             LATCHED,
             "calibration",
-            "per other sensor (`source`): what it stamps (`time_ref`) when the reference sensor stamps with the "
-            "header's stamp; holds from there on",
+            "per other sensor (`source`): its time (`time_ref`) at the reference sensor's time in the header; in "
+            "force from then on",
         ),
         TopicSpec(
             graph.TF_STATIC,
@@ -177,17 +182,24 @@ SYSTEM = System(
             POINT_CLOUD,
             graph.SKELETON,
             "fusion",
-            "the person in `world`, by the stamps of the reference sensor; in addition covariance `xx xy xz yy yz zz`; "
-            "with `subject: all` everybody, with the person's number in `body`",
+            "the person in `world`, as `/<sensor>/skeleton` with the stamps of the reference sensor, and covariance "
+            "`xx xy xz yy yz zz`; with `subject: all` everybody, with the person's number in `body`",
         ),
     ),
     services=(
         Service(
             graph.START_SERVICE,
             "calibration",
-            "estimate the poses anew; what is published holds until the new estimate",
+            "estimate the poses anew; the published ones stay in force until then, and move slowly to the new ones",
         ),
-        Service(graph.RESET_SERVICE, "calibration", "forget the calibration"),
+        Service(
+            graph.RESET_SERVICE,
+            "calibration",
+            "discard the calibration; the published poses stay in force until "
+            "the new estimate, which replaces them at once",
+        ),
     ),
-    commands=(Command("calibrate", "body_tracking.recording.calibrate", "the poses and clocks of a bag's sensors"),),
+    commands=(
+        Command("calibrate", "body_tracking.recording.calibrate", "estimate the poses and clocks of a bag's sensors"),
+    ),
 )

@@ -20,16 +20,16 @@ ANGLES = (
     Parameter(
         "convention",
         graph.AUTO,
-        "which angles: the model's own, those of the ISB, of REP-155, of Schlagenhauf (2017), or angles between joint "
-        "positions; auto: model where they are made of a model's state, else positional",
+        "the angles: the model's own, those of the ISB, of REP-155, of Schlagenhauf (2017), or angles between joint "
+        "positions; auto: model if the input is a model's state, else positional",
         choices=(graph.AUTO, *ALL_CONVENTIONS),
         live=True,
     ),
     Parameter(
         "input",
         graph.AUTO,
-        "what they are made of: the state of the filter's model, or filtered skeletons, to which a model is fitted "
-        "(positional angles need none); auto: what the filter publishes, also where that changes",
+        "source of the angles: the state of the filter's model, or filtered skeletons, to which a model is fitted "
+        "(but not for positional angles); auto: what the filter publishes, also when the filter changes",
         choices=(graph.AUTO, graph.SKELETON_INPUT, graph.MODEL_INPUT),
         live=True,
     ),

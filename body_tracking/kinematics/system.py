@@ -49,7 +49,7 @@ SYSTEM = System(
         Option(
             "convention",
             "",
-            "of the joint angles; overrides the file, too",
+            "convention of the joint angles; overrides the parameters file",
             choices=_conventions,
             parameter=("joint_angles", "convention"),
         ),
@@ -61,14 +61,15 @@ SYSTEM = System(
             JOINT_STATE,
             RELIABLE,
             "joint_angles",
-            "angle and angular velocity per name, capture stamp; names end in `_<id>`; `frame_id` names the convention",
+            "joint angles and angular velocities, with the capture time; names end in `_<id>`; `frame_id` names the "
+            "convention",
         ),
         TopicSpec(
             graph.joint_states_stddev_topic("<id>"),
             JOINT_STATE,
             RELIABLE,
             "joint_angles",
-            "the standard deviation of each, same header, names and order; infinity where there is no estimate",
+            "their standard deviations, with the same header, names and order; infinity where there is no estimate",
         ),
     ),
 )

@@ -24,7 +24,7 @@ _CV: Any = cv2
 
 
 class BoardError(BodyTrackingError):
-    """A board that does not exist, an image that is none, or an OpenCV without the detector."""
+    """Raised for an impossible board, an unreadable image, or an OpenCV without the detector."""
 
 
 @dataclass(frozen=True, slots=True)

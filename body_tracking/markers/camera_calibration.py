@@ -46,7 +46,7 @@ _CV: Any = cv2
 
 
 class CalibrationError(BodyTrackingError):
-    """Cameras cannot be calibrated from what they saw."""
+    """Raised when cameras cannot be calibrated from their images."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +55,8 @@ class Rejected:
 
     Attributes:
         view: index of the instant.
-        camera: frame of the camera whose board it is; None where two cameras contradict each other, and nothing says
-            which of them is wrong.
+        camera: frame of the camera whose board it is; None where two cameras contradict each other and it is unknown
+            which is wrong.
         reason: in words.
     """
 

@@ -128,15 +128,15 @@ class CameraImagesStage(Stage):
         Parameter(
             "images",
             RENDER,
-            "where they come from: the drivers' topics with commas, in the order of the rig's cameras; folder:PATH, a "
-            "folder of files per camera, equal names for images taken together; render, the simulated arm to which "
-            "config/marker_setup belongs",
+            "source of the images: the drivers' topics with commas, in the order of the rig's cameras; folder:PATH, a "
+            "folder of files per camera, equal names for images taken together; render, the simulated arm of "
+            "config/marker_setup",
         ),
         Parameter("rate", 30.0, "sets of images per second, of files and rendered ones", "Hz", 0.1, 200.0),
         Parameter("loop", False, "begin again at the end of the files"),
-        Parameter("best_effort", False, "for drivers that publish their images best effort"),
-        Parameter("tolerance", 0.002, "by which the drivers' stamps of one set may differ", "s", 0.0, 0.1),
-        Parameter("max_wait", 0.05, "how long a set waits for a driver's missing image", "s", 0.0, 1.0),
+        Parameter("best_effort", False, "true if the drivers publish their images best effort"),
+        Parameter("tolerance", 0.002, "largest difference between the drivers' stamps of one set", "s", 0.0, 0.1),
+        Parameter("max_wait", 0.05, "longest wait of a set for a driver's missing image", "s", 0.0, 1.0),
     )
 
     def __init__(self, values: Mapping[str, Value], wanted: Callable[[str], bool] = lambda topic: True) -> None:

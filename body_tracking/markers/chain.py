@@ -88,7 +88,7 @@ class JointDescription:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChainFit:
-    """A fitted chain and what it is worth.
+    """A fitted chain and its quality.
 
     Attributes:
         chain: with its covariance.

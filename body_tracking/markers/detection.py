@@ -69,19 +69,24 @@ class DetectionSettings:
     bright: float = number_field(0.9999, "quantile of the brightness that is a ball's", "", 0.99, 1.0)
     lower: float = number_field(
         0.1,
-        "where the threshold is between the two; Gaschler has 0.2, less finds far balls beside near ones",
+        "place of the threshold between background (0) and balls (1); Gaschler has 0.2, a smaller value finds far "
+        "balls beside near ones",
         "",
         0.0,
         1.0,
     )
     noise: float = number_field(
-        6.0, "by which the threshold is above the background at least, standard deviations of its noise", "", 3.0, 100.0
+        6.0, "least distance of the threshold from the background, standard deviations of its noise", "", 3.0, 100.0
     )
     least_area: float = number_field(
-        5.0, "area above the threshold under which a region is a glint or a broken pixel", "px^2", 1.0, 1e4
+        5.0, "smallest area of a ball; a smaller region is a glint or a broken pixel", "px^2", 1.0, 1e4
     )
-    most_area: float = number_field(2500.0, "area above which it is a lamp, a window, a coat", "px^2", 10.0, 1e6)
-    most_balls: float = number_field(64.0, "regions of an image that are measured, the largest", "", 1.0, 1000.0)
+    most_area: float = number_field(
+        2500.0, "largest area of a ball; a larger region is a lamp, a window, a coat", "px^2", 10.0, 1e6
+    )
+    most_balls: float = number_field(
+        64.0, "largest number of regions of an image that are measured, the largest first", "", 1.0, 1000.0
+    )
     elongation: float = number_field(
         1.12, "ratio of its axes from which a region is taken for more or less than one whole ball", "", 1.0, 10.0
     )

@@ -1,4 +1,4 @@
-"""Whether targets can be told apart, and each of them from itself turned round."""
+"""Whether targets can be distinguished, and each of them from itself rotated."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ the margin that recognition demands in 1 %."""
 
 
 class TargetsAlikeError(BodyTrackingError):
-    """Two targets, or a target and itself turned round, cannot be told apart."""
+    """Raised when two targets, or a target and itself rotated, cannot be distinguished."""
 
 
 def check_distinct(targets: Sequence[Target], noise: float, hidden: int = 1) -> None:
@@ -34,7 +34,7 @@ def check_distinct(targets: Sequence[Target], noise: float, hidden: int = 1) -> 
     Args:
         targets: all that are used together.
         noise: standard deviation of a measured point, metres; of the largest one, along the line of sight.
-        hidden: balls that may be hidden of a target that has four more to be told by.
+        hidden: balls that may be hidden of a target that has at least four others.
 
     Raises:
         TargetsAlikeError: the text names the pair, the balls and the distance.

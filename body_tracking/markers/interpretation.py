@@ -1,4 +1,4 @@
-"""Which of several ways to see the targets in the points is right, or that it cannot be told.
+"""Choice among several interpretations of the points as targets, or the result that it is ambiguous.
 
 The cost of a way to see a target is minus twice the logarithm of its likelihood, but for a constant: the squared
 Mahalanobis distance of its points, and a fixed amount for each ball that is not seen. A point is a ball of one target

@@ -1,7 +1,7 @@
 """Single joints between two targets from a recording of both (Gaschler 2011, sections 5.1 and 5.2).
 
 A closed form (:mod:`body_tracking.markers.joint_starts`) starts the maximum likelihood adjustment
-(:mod:`body_tracking.markers.chain_likelihood`). A fit says what it is worth: standard deviations grow as the motion
+(:mod:`body_tracking.markers.chain_likelihood`). A fit states its quality: standard deviations grow as the motion
 gets smaller, and a verdict with warnings says when the motion was too small, about one axis only, or not of the joint's
 kind.
 """
@@ -62,7 +62,7 @@ _WORST: Final = tuple(Verdict)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointFit:
-    """A joint and what it is worth.
+    """A fitted joint and its quality.
 
     Attributes:
         joint: with its covariance.

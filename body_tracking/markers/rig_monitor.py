@@ -1,4 +1,4 @@
-"""Watches a calibrated rig: tells a camera that was turned from cameras that are out of step.
+"""Watches a calibrated rig: distinguishes a camera that was turned from cameras that are out of step.
 
 Both leave balls beside the epipolar lines of their other images. A turned camera shows a constant pattern over the
 image, also for balls at rest; cameras out of step show distances that are proportional to the velocity in the image.
@@ -43,7 +43,7 @@ class Fault(Enum):
 
 @dataclass(frozen=True, slots=True)
 class MonitorSettings:
-    """When a fault is told.
+    """When a fault is reported.
 
     Attributes:
         window: seconds of images that are looked at.
@@ -52,10 +52,10 @@ class MonitorSettings:
         partners: most balls within reach; a ball with more is left out.
         noise: standard deviation of an epipolar distance, pixels.
         jitter: standard deviation of the cameras' capture times, seconds.
-        min_seconds: that the window must hold before anything is told.
+        min_seconds: that the window must hold before anything is reported.
         min_distances: fewest distances in the window.
-        min_turn: least turn that is told, radians.
-        min_delay: least delay that is told, seconds.
+        min_turn: least turn that is reported, radians.
+        min_delay: least delay that is reported, seconds.
         significance: standard deviations that a turn or delay must exceed.
         complete: share of the balls that it must bring to a partner's epipolar line.
         ahead: by which the log likelihood must be better than another cause's.
@@ -152,7 +152,7 @@ class _Explanation:
 
 
 class RigMonitor:
-    """Collects epipolar distances, and answers what is wrong."""
+    """Collects epipolar distances and diagnoses faults of the rig."""
 
     def __init__(self, rig: Rig, settings: MonitorSettings = _DEFAULT) -> None:
         """Watch a rig of two cameras or more."""

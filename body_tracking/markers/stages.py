@@ -129,13 +129,18 @@ class TriangulationStage(Stage):
     PARAMETERS = (
         SETUP,
         Parameter(
-            "diameter", 0.0, "of the balls; 0: the centroid of a ball's image is taken for its centre", "m", 0.0, 0.2
+            "diameter",
+            0.0,
+            "diameter of the balls; 0: the centroid of a ball's image counts as its centre",
+            "m",
+            0.0,
+            0.2,
         ),
-        Parameter("tolerance", 0.002, "by which the stamps of one set of images may differ", "s", 0.0, 0.1),
+        Parameter("tolerance", 0.002, "largest difference between the stamps of one set of images", "s", 0.0, 0.1),
         Parameter(
             "max_wait",
             0.25,
-            "how long a set of images waits for a missing one, unless a later one is complete before",
+            "longest wait of a set of images for a missing one, unless a later set is complete before",
             "s",
             0.0,
             1.0,
@@ -241,14 +246,12 @@ class TrackerStage(Stage):
     NAME = "rigid_body_tracker"
     PARAMETERS = (
         SETUP,
-        Parameter(
-            "deadline", 0.02, "time for one frame, after which the search for targets is given up", "s", 0.001, 1.0
-        ),
+        Parameter("deadline", 0.02, "longest time for one frame; then the search for targets ends", "s", 0.001, 1.0),
         Parameter(
             "tf",
             "targets",
-            "which targets become frames on /tf: all; only the root of the chain, as robot_state_publisher with "
-            "chain.urdf needs it; none",
+            "targets that become frames on /tf: all; only the root of the chain, for robot_state_publisher with "
+            "chain.urdf; none",
             choices=("targets", "root", "none"),
         ),
         TRANSPORT,
@@ -292,7 +295,7 @@ class AnglesOfTargetsStage(Stage):
     NAME = "marker_joint_angles"
     PARAMETERS = (
         SETUP,
-        Parameter("max_wait", 0.02, "how long the poses of one time wait for that of another target", "s", 0.0, 1.0),
+        Parameter("max_wait", 0.02, "longest wait of the poses of one time for another target's", "s", 0.0, 1.0),
         TRANSPORT,
     )
 

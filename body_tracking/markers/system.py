@@ -99,8 +99,8 @@ SYSTEM = System(
         Option(
             "marker_setup",
             "",
-            "track infrared markers, with the rig.yaml, targets.yaml and chain.yaml in this folder (no rig.yaml where "
-            "another motion capture system measures the points)",
+            "track infrared markers with the rig.yaml, targets.yaml and chain.yaml in this folder (without rig.yaml "
+            "if another motion capture system measures the points)",
             "FOLDER",
             path=True,
             example="setup",
@@ -128,7 +128,7 @@ SYSTEM = System(
             IMAGE,
             Qos(reliability="reliable", depth=10),
             "marker_cameras",
-            "sets of images with equal stamps, `mono8` or `mono16`; or of a driver",
+            "sets of images with equal stamps, `mono8` or `mono16`; a driver may publish them instead",
         ),
         TopicSpec(
             setup.info_topic("<camera>"),

@@ -32,7 +32,7 @@ FAR: Final = "points too far away"
 
 
 class TrajectoryError(BodyTrackingError):
-    """A file of points lacks what is asked of it."""
+    """Raised when a file of points lacks the requested content."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

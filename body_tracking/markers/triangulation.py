@@ -8,7 +8,7 @@ point is that of the centroids' noise; what the calibration is wrong by is :func
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -27,7 +27,7 @@ _STEPS: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class TriangulationSettings:
-    """What is taken for a ball seen by several cameras.
+    """When balls of several cameras are the same ball.
 
     Attributes:
         gate: how far a ball may be from another's epipolar line, or from where other cameras say it is, in standard
@@ -37,10 +37,17 @@ class TriangulationSettings:
         farthest: metres before each camera.
     """
 
-    gate: float = 4.0
+    gate: float = field(
+        default=4.0,
+        metadata={"doc": "largest distance of a ball from another's epipolar line, standard deviations"},
+    )
     alternatives: int = 3
-    nearest: float = 0.1
-    farthest: float = 20.0
+    nearest: float = field(
+        default=0.1, metadata={"doc": "shortest distance of a ball from each camera, along its axis", "unit": "m"}
+    )
+    farthest: float = field(
+        default=20.0, metadata={"doc": "longest distance of a ball from each camera, along its axis", "unit": "m"}
+    )
 
     def __post_init__(self) -> None:
         if not (self.gate > 0.0 and self.alternatives > 0 and 0.0 < self.nearest < self.farthest):

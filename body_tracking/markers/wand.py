@@ -39,7 +39,7 @@ _CV: Any = cv2
 
 
 class WandError(BodyTrackingError):
-    """A wand that is none, or cameras that did not see enough of it together."""
+    """Raised for an impossible wand, or cameras that did not see enough of it together."""
 
 
 @dataclass(frozen=True, slots=True)

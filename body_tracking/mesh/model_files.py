@@ -28,7 +28,7 @@ EXTRA: Final = ("joint_names", "frames")
 
 
 class ModelFileError(BodyTrackingError):
-    """A body model file cannot be read, or is none."""
+    """Raised when a body model file cannot be read or is invalid."""
 
 
 def read(path: Path) -> dict[str, npt.NDArray[Any]]:

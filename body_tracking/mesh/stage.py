@@ -32,12 +32,13 @@ DEPTH = Parameter("depth", (), "depth cameras; the node takes /<sensor>/depth/im
 PERSON = Parameter(
     "person",
     "",
-    "YAML file with the shape of the person's body; written after a personalisation where it is not there",
+    "YAML file with the shape of the person's body; written after a personalisation if it does not exist",
 )
 _PERSONALISED_FROM = Parameter(
     "personalise_from",
     5,
-    "images in different poses from which the shape of a person is estimated, unless a file says it; 0 for never",
+    "number of images in different poses from which the shape of a person is estimated, unless a file has it; 0 for "
+    "never",
     min=0,
     max=12,
 )

@@ -59,15 +59,16 @@ SYSTEM = System(
         Option(
             "depth",
             (),
-            "fit the mesh of a body to the images of this depth camera, /<sensor>/depth/image_raw; its skeletons are "
-            "those of a sensor SENSOR_mesh",
+            "fit the mesh of a body to the images of this depth camera, /<sensor>/depth/image_raw; the skeletons are "
+            "published as those of a sensor SENSOR_mesh",
             "SENSOR",
             example=("kinect1",),
         ),
         Option(
             "person",
             "",
-            "YAML file with the shape of the person's body for --depth; written when it was estimated, if not there",
+            "YAML file with the shape of the person's body for --depth; written after a personalisation if it does "
+            "not exist",
             "FILE",
             path=True,
         ),
@@ -78,8 +79,8 @@ SYSTEM = System(
             POINT_CLOUD,
             graph.SKELETON,
             "mesh_tracker",
-            "the joints of the fitted body in `<sensor>_mesh_optical_frame`, with covariance as `/fused/skeleton`; "
-            "centres of rotation, joints that the image does not show are inferred",
+            "the joints (centres of rotation) of the fitted body in `<sensor>_mesh_optical_frame`, with covariance as "
+            "`/fused/skeleton`; joints that the image does not show are inferred",
         ),
         TopicSpec(
             mesh_topic("<sensor>"),

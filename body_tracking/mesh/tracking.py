@@ -50,10 +50,10 @@ class TrackerParameters:
     """Settings of the tracker; each field's metadata has its meaning, unit and range."""
 
     points: int = field(
-        default=600, metadata={"doc": "measured points of the person in a fit", "min": 100, "max": 5000}
+        default=600, metadata={"doc": "number of measured points of the person per fit", "min": 100, "max": 5000}
     )
-    predict_for: float = number_field(0.5, "how long a person who is lost is expected where they were", "s", 0.0, 5.0)
-    search_every: float = number_field(0.2, "between two searches for a person", "s", 0.0, 10.0)
+    predict_for: float = number_field(0.5, "time for which a lost person is expected at the last place", "s", 0.0, 5.0)
+    search_every: float = number_field(0.2, "time between two searches for a person", "s", 0.0, 10.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -25,25 +25,25 @@ from body_tracking.ros.wire import ROS
 
 PARAMETERS = (
     Parameter("bag", "", "the bag: a folder, or a single mcap file"),
-    Parameter("rate", 1.0, "bag seconds per second", min=1e-3, max=1e4, live=True),
-    Parameter("loop", False, "begin again at the end; /clock and stamps jump back then", live=True),
-    Parameter("start_offset", 0.0, "how much of the bag to leave out at its beginning", unit="s", min=0.0),
+    Parameter("rate", 1.0, "playback speed, recorded seconds per second", min=1e-3, max=1e4, live=True),
+    Parameter("loop", False, "play again from the beginning at the end; /clock and stamps then jump back", live=True),
+    Parameter("start_offset", 0.0, "skip this much at the beginning of the bag", unit="s", min=0.0),
     Parameter("topics", (), "play only these topics; empty for all"),
     Parameter(
         "clock_rate",
         100.0,
-        "/clock this often, besides one before each message; 0 for no /clock at all",
+        "publish /clock this often, and before each message; 0 for no /clock",
         unit="Hz",
         min=0.0,
         max=1000.0,
     ),
-    Parameter("reliable", False, "offer every topic reliably, so that nothing is lost, whatever was recorded"),
+    Parameter("reliable", False, "offer every topic reliably, whatever was recorded, so that nothing is lost"),
     Parameter(
         "wait_for_subscribers",
         (),
         "topics that must have a subscriber before the bag starts, as /topic or /topic:NUMBER_OF_SUBSCRIBERS",
     ),
-    Parameter("wait_timeout", 30.0, "start even so after this; 0 to wait for as long as it takes", unit="s", min=0.0),
+    Parameter("wait_timeout", 30.0, "start without subscribers after this; 0 to wait without limit", unit="s", min=0.0),
     Parameter("start_paused", False, "wait for ~/resume before the first message"),
     Parameter("on_end", "exit", "what to do after the last message", choices=("exit", "idle")),
 )
@@ -120,7 +120,7 @@ class BagPlayer(GraphNode):
         publishers = {}
         for topic in topics:
             if topic == graph.CLOCK_TOPIC and self.values["clock_rate"]:
-                self.get_logger().info("the recorded /clock is not played: /clock is this playback's own")
+                self.get_logger().info("the recorded /clock is not played: the player publishes its own")
                 continue
             info = self.reader.topics[topic]
             qos = info.qos

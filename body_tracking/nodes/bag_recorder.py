@@ -27,7 +27,7 @@ PARAMETERS = (
     Parameter(
         "folder",
         "",
-        "the bag; one that is there is continued. Empty for body_tracking_<date> in the working directory. May change "
+        "the bag; an existing one is continued. Empty for body_tracking_<date> in the working directory. May change "
         "between recorder/stop and recorder/start",
         live=True,
     ),
@@ -47,15 +47,17 @@ PARAMETERS = (
     Parameter(
         "model_covariance",
         False,
-        "where topics is empty: record /filtered/model_covariance (and that of each of several people), too; with ekf "
-        "it is most of a recording, and body_tracking replay computes it again. May change likewise",
+        "where topics is empty: also record /filtered/model_covariance (of each person); with ekf it is most of a "
+        "recording, and body_tracking replay computes it again. May change likewise",
         live=True,
     ),
-    Parameter("start_recording", True, "begin at once, not only with recorder/start", fixed="it is about the start"),
+    Parameter(
+        "start_recording", True, "record from the start; false: wait for recorder/start", fixed="it is about the start"
+    ),
     Parameter(
         "chunk_seconds",
         1.0,
-        "at least this often everything is written through to the disk: what a power failure may cost",
+        "longest time between two writes to the disk, which a power failure may cost",
         unit="s",
         min=0.01,
         max=3600.0,

@@ -44,8 +44,8 @@ PARAMETERS = (
     Parameter(
         "tf",
         "segments",
-        "which of a person's segments become frames, where the filter has a model: all; only the pelvis, as "
-        "robot_state_publisher with the person's URDF needs it; none",
+        "segments that become frames on /tf, if the filter has a model: all; only the pelvis, for "
+        "robot_state_publisher with the person's URDF; none",
         choices=("segments", "root", "none"),
     ),
     SENSORS,

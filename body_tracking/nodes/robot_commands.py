@@ -3,7 +3,7 @@
 A node of its own, so that it does not end with the nodes that it monitors. However the rest of the graph ends, it holds
 the robot ``silence`` seconds after the last input, by the wall clock, also while ``/clock`` stands still. If this node
 ends, the commands end, and the robot's controller decides what follows. It publishes no command while another node
-publishes them. No safety-rated function: docs/robots.md.
+publishes them. Not a safety-rated function: docs/robots.md.
 """
 
 from __future__ import annotations

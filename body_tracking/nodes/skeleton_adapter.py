@@ -24,7 +24,9 @@ from body_tracking.ros.main import run
 from body_tracking.ros.node import GraphNode
 
 PARAMETERS = (
-    Parameter("sensor", "azure1", "the sensor's name: its topic is /<sensor>/skeleton, its frame that name too"),
+    Parameter(
+        "sensor", "azure1", "the sensor's name, in its topic /<sensor>/skeleton and its frame <sensor>_optical_frame"
+    ),
     Parameter(
         "topic",
         "body_tracking_data",

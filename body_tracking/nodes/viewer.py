@@ -52,9 +52,11 @@ from body_tracking.viewing.snapshot import PageError, Seen, Snapshot, SystemView
 
 PARAMETERS = (
     Parameter(
-        "host", "127.0.0.1", "address to serve the page at; any other than this machine's own lets others press buttons"
+        "host",
+        "127.0.0.1",
+        "address at which the page is served; all but loopback addresses let other machines press the buttons",
     ),
-    Parameter("port", 8080, "first port that is tried; the next ones where it is taken, 0 for any", min=0, max=65535),
+    Parameter("port", 8080, "the port; if it is taken, the next free one; 0 for any", min=0, max=65535),
     Parameter(
         "rate", 15.0, "draw at most this often, and only while a browser shows the page", unit="Hz", min=0.1, max=60.0
     ),
@@ -157,7 +159,7 @@ class ViewerNode(GraphNode):
         print(f"open {page.address} in a browser", flush=True)
         self.get_logger().info(f"the page is at {page.address}")
         if not _is_loopback(given["host"]):
-            self.get_logger().warning(f"the page is at {page.address}: everyone who reaches that address can use it")
+            self.get_logger().warning(f"the page is at {page.address}: everyone who can reach that address can use it")
         return page
 
     # --- inputs
@@ -224,7 +226,7 @@ class ViewerNode(GraphNode):
                     self.get_logger().fatal(f"drawing failed {failed} times: {traceback.format_exc()}")
                     self.context.try_shutdown()
                     return
-                self.log_throttled("drawing", f"drawing failed, and is tried again: {traceback.format_exc()}")
+                self.log_throttled("drawing", f"drawing failed, trying again: {traceback.format_exc()}")
             spent = time.monotonic() - begin
             self.drawing_s += spent
             rest = max(1.0 / float(str(self.values["rate"])) - spent, spent * (1.0 / _SHARE - 1.0))

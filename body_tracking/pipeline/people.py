@@ -27,15 +27,15 @@ class PeopleParameters:
     subject: str = field(
         default=NEAREST,
         metadata={
-            "doc": "the tracked person: the one nearest to the reference sensor at first, or the one seen "
-            "first, for as long as that person is there; or all, each under a number and with topics of their own",
+            "doc": "the tracked person, until that person leaves: the one nearest to the reference sensor at first, "
+            "or the one seen first; or all, each with an id and topics of their own",
             "choices": SUBJECTS,
         },
     )
     people: int = field(
         default=MAX_PEOPLE,
         metadata={
-            "doc": "subject all: how many people at most; their ids are body1, body2, ...",
+            "doc": "with subject all: the largest number of people; their ids are body1, body2, ...",
             "min": 1,
             "max": 16,
         },
@@ -43,7 +43,7 @@ class PeopleParameters:
     hold: float = field(
         default=HOLD,
         metadata={
-            "doc": "an unseen person keeps the id for this long; then another one is chosen, or gets it",
+            "doc": "an unseen person keeps the id for this long; then it is free for another person",
             "unit": "s",
             "min": 0.5,
             "max": 60.0,

@@ -97,9 +97,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     command.add_argument(
         "--method",
         choices=("robust", "thesis"),
-        help="robust (default): refined over the movement; thesis: one still pose of 50 frames",
+        help="robust (default): refined while the person moves; thesis: one still pose of 50 frames",
     )
-    command.add_argument("--sensors", metavar="A,B", help="use these (default: all in the bag)")
+    command.add_argument("--sensors", metavar="A,B", help="the sensors (default: all in the bag)")
     command.add_argument("--reference", metavar="A", help="the sensor that defines world (default: the first)")
     command.add_argument(
         "--params-file", type=Path, metavar="F", help="ROS parameters file, as for the calibration node"

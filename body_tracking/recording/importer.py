@@ -328,7 +328,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="standard deviation of each coordinate of these points (default %(default)s)",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an existing bag")
-    parser.add_argument("--partial", action="store_true", help="import files that are cut off as far as they go")
+    parser.add_argument("--partial", action="store_true", help="import the complete part of files that are cut off")
     parser.add_argument("--json", action="store_true", help="print what was imported as JSON")
     parser.set_defaults(run=run)
 

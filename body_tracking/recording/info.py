@@ -126,13 +126,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add ``bag info`` and ``bag recover`` to the ``body_tracking`` command."""
     parser = subparsers.add_parser("bag")
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
-    info = verbs.add_parser("info", help="what is in a bag, and what is missing")
+    info = verbs.add_parser("info", help="list the contents of a bag, and what is missing")
     info.add_argument("bag", type=Path, metavar="BAG", help="a folder, or a single mcap file")
-    info.add_argument("--json", action="store_true", help="print it as JSON")
+    info.add_argument("--json", action="store_true", help="print the result as JSON")
     info.set_defaults(run=run)
     closing = verbs.add_parser("recover", help="close a bag whose recorder died, so that ros2 bag opens it too")
     closing.add_argument("bag", type=Path, metavar="BAG", help="the folder")
-    closing.add_argument("--json", action="store_true", help="print what is in it then as JSON")
+    closing.add_argument("--json", action="store_true", help="print its contents afterwards as JSON")
     closing.set_defaults(run=run)
 
 

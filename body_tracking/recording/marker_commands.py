@@ -419,9 +419,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = command("angles", angles, "Compute the joint angles in a recording; writes them into a new one.")
     parser.add_argument("bag", type=Path, metavar="BAG", help="a recording of images, balls or points")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="the bag to be written")
-    parser.add_argument("--overwrite", action="store_true", help="replace OUT if it is there")
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing OUT")
 
-    parser = command("check", check, "Read a setup, and say whether its targets can be told apart.")
+    parser = command("check", check, "Read a setup, and check whether its targets can be distinguished.")
     parser.add_argument("--noise", type=float, default=3e-4, metavar="METRES", help="of a point (default %(default)s)")
 
     load(f"{_RENDER}:add_parser")(commands)

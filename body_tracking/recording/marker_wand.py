@@ -137,7 +137,7 @@ def read_wand(path: Path, cameras: Sequence[Camera], wand: Wand, views: int = _V
 
 
 def report_of(found: WandCalibration, recording: WandRecording) -> dict[str, Any]:
-    """What a calibration says of itself, in millimetres, degrees and pixels."""
+    """The quality of a calibration, in millimetres, degrees and pixels."""
     rig, cameras = found.rig, {}
     for index, (camera, end) in enumerate(zip(rig.cameras, projection.offsets(rig)[1:], strict=True)):
         rows = recording.seen.cameras == index

@@ -318,7 +318,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     command.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="the bag to be written")
     command.add_argument("--reference", metavar="A", help="the sensor that defines world (default: the first)")
-    command.add_argument("--body", default=graph.DEFAULT_BODY, help="id of the only subject (default: %(default)s)")
+    command.add_argument(
+        "--body", default=graph.DEFAULT_BODY, help="id of the person, if only one is tracked (default: %(default)s)"
+    )
     names = ("sensors", "filter", "convention", "calibration", "imus", "subject", "people", "params_file")
     cameras = ("marker_setup", "marker_points", "depth", "person")
     add_options(
@@ -327,13 +329,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         *cameras,
         "model_covariance",
         filter=f"default: {DEFAULT_FILTER}",
-        convention="of the joint angles (default: by the filter)",
-        sensors="use these, the first as reference; none: no skeletons, markers or depth alone (default: all in the "
+        convention="convention of the joint angles (default: that of the filter)",
+        sensors="the sensors, the reference first; none: no skeletons, markers or depth alone (default: all in the "
         "bag)",
         calibration="start from this calibration (YAML)",
-        model_covariance="with ekf: write /filtered/model_covariance, too; it is most of such a bag",
+        model_covariance="with ekf: also write /filtered/model_covariance, which is most of such a bag",
     )
-    command.add_argument("--overwrite", action="store_true", help="replace OUT if it is there")
+    command.add_argument("--overwrite", action="store_true", help="replace an existing OUT")
     command.add_argument("--json", action="store_true", help="print the report as JSON")
     command.set_defaults(run=run)
 

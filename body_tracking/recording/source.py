@@ -34,7 +34,7 @@ class RecordingSource:
 
     The recording's zero is the receipt of its first frame of any sensor, so that the sensors of one recording, each
     played by a process of its own with the same ``start_time``, stay in step. A frame is stamped with the time at which
-    it plays minus its delay then (see :mod:`body_tracking.recording.stamps`); in a loop, time goes on.
+    it plays minus its delay then (see :mod:`body_tracking.recording.stamps`); in a loop, stamps continue.
 
     Args:
         settings: uses ``file``, ``sensor``, ``recorded_sensor``, ``rate``, ``loop`` and ``start_time``.

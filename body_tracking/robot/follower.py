@@ -21,7 +21,7 @@ or less certain than allowed; no good calibration; a robot that is silent or off
 of ``STANDSTILL`` stop at once, without holding.
 
 The caller passes two times: ``now_ns`` in ROS time, as stamps are (it may stand still or jump), and ``steady_ns``,
-which is monotonic. This is no safety-rated function.
+which is monotonic. This is not a safety-rated function.
 """
 
 from __future__ import annotations
@@ -225,7 +225,7 @@ class Follower:
         mapping = self.mapping
         if convention != mapping.convention:
             said = f"the convention {convention!r}" if convention else "no convention (an empty frame_id)"
-            return f"angles are of {said}, the mapping is about {mapping.convention!r}"
+            return f"angles are of {said}, the mapping needs {mapping.convention!r}"
         if names == mapping.names:
             return ""
         missing = [name for name in mapping.names if name not in names]
@@ -369,7 +369,7 @@ class Follower:
         if self._other_publishers:
             return self._other_publishers
         if elapsed > STANDSTILL:
-            return f"the commands themselves stood still for {elapsed:.2f} s"
+            return f"gap in the commands of {elapsed:.2f} s"
         return self._check_tracking(steady_ns)
 
     def _fault(self, steady_ns: int, elapsed: float, prediction: _Prediction) -> str:
@@ -390,7 +390,7 @@ class Follower:
             if steady_ns - max(received) >= allowed_ns:
                 return f"no frame of {listed} for {(steady_ns - max(received)) / NANOSECONDS:.2f} s"
         if elapsed > limits.silence:
-            return f"the commands themselves stood still for {elapsed:.2f} s"
+            return f"gap in the commands of {elapsed:.2f} s"
         if age > limits.max_age or age < -_AHEAD:
             said = (
                 f"{age:.2f} s old, limit {limits.max_age:g} s" if age > 0.0 else f"stamped {-age:.2f} s in the future"
@@ -409,7 +409,7 @@ class Follower:
             if not np.isfinite([angle, rate]).all():
                 return f"{name} is not finite, or its velocity is not known"
             if not np.isfinite(prediction.angle[place]):
-                return f"{name} is {angle:.3g} rad at {rate:.3g} rad/s, which no body does"
+                return f"{name} is {angle:.3g} rad at {rate:.3g} rad/s; a person does not move so"
             if not prediction.stddev[place] <= most:
                 return f"standard deviation of {name} is {prediction.stddev[place]:.2f} rad, limit {most:g}"
         raise AssertionError(f"nothing is wrong with {self.mapping.joints[joint]}")

@@ -50,7 +50,7 @@ def convention_of(mapping: Path, asked: str) -> str:
 
     found = load(mapping, {name: angle_names(name) for name in ALL_CONVENTIONS}).convention
     if asked not in ("", graph.AUTO, found):
-        raise graph.GraphError(f"convention {asked}: {mapping} is about angles of the convention {found}")
+        raise graph.GraphError(f"convention {asked}: {mapping} needs angles of the convention {found}")
     return found
 
 
@@ -63,7 +63,7 @@ SYSTEM = System(
         Option(
             "robot",
             "",
-            "mapping file of a robot that is to follow; see docs/robots.md",
+            "mapping file of a robot that follows the angles; see docs/robots.md",
             "FILE",
             path=True,
             example="robot.yaml",
@@ -75,16 +75,16 @@ SYSTEM = System(
             JOINT_TRAJECTORY,
             RELIABLE,
             "robot_commands",
-            "one point for the robot's joints; or `std_msgs/Float64MultiArray`, as the mapping file says; silent while "
-            "stopped",
+            "commands of the robot's joints, one point; or `std_msgs/Float64MultiArray`, as the mapping file says; "
+            "none while stopped",
         ),
     ),
     services=(
         Service(
             "robot_commands/enable",
             "robot_commands",
-            "an operator confirms that the robot stands at `home` or where it was left, and may move; below the node's "
-            "own name",
+            "an operator confirms that the robot is at `home` or where it was left, and may move; in the node's own "
+            "namespace",
         ),
     ),
 )

@@ -165,11 +165,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add ``doctor`` to the ``body_tracking`` command."""
     parser = subparsers.add_parser(
         "doctor",
-        description="Why nothing comes: looks at this shell's ROS environment, libraries, clock, and who publishes "
-        "what in the ROS domain, or at a recording; says what to do. Exit code 0 without a problem, 1 with one.",
+        description="Find out why nothing arrives: checks this shell's ROS environment, libraries and clock, and the "
+        "publishers and subscribers in the ROS domain, or a recording, and says what to do. Exit code 1 "
+        "if there is a problem.",
     )
-    parser.add_argument("--bag", type=Path, metavar="BAG", help="look at this recording instead")
-    parser.add_argument("--sensors", default="", metavar="A,B", help="these must be there; in a namespace: NAMESPACE/A")
+    parser.add_argument("--bag", type=Path, metavar="BAG", help="check this recording instead")
+    parser.add_argument(
+        "--sensors", default="", metavar="A,B", help="sensors that must publish; in a namespace: NAMESPACE/A"
+    )
     parser.set_defaults(run=run)
 
 

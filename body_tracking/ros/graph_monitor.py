@@ -34,7 +34,7 @@ _FRESH = 3.0
 
 
 class GraphMonitor:
-    """Subscribes in a thread of its own.
+    """Subscribes in its own thread.
 
     Args:
         angles_topics: of the joint angles that the graph publishes.

@@ -300,7 +300,7 @@ class GraphNode(BatchNode):
         key = f"raised {where} {kind}"
         if self._may_log(key):
             trace = "".join(traceback.format_exception(error))
-            self.get_logger().error(f"{where}: {kind} in a callback, which is left out: {error}\n{trace}")
+            self.get_logger().error(f"{where}: {kind} in a callback; message skipped: {error}\n{trace}")
         if self._failed_in_a_row[where] % _FAILURES == 0:
             self.log_throttled(f"anew {where}", f"{where}: failed {_FAILURES} times in a row; resetting")
             with contextlib.suppress(Exception):

@@ -11,7 +11,9 @@ SYSTEM = System(
     "graph",
     order=7,
     options=(
-        Option("namespace", "/", "of all nodes, and so of their topics; a second rig needs one", "NAME"),
+        Option(
+            "namespace", "/", "namespace of all nodes and topics, for a second graph in the same ROS domain", "NAME"
+        ),
         Option("params_file", "", "ROS parameters file; see config/", "FILE", path=True),
     ),
     topics=(
@@ -28,8 +30,8 @@ SYSTEM = System(
         Command(
             "doctor",
             "body_tracking.ros.doctor",
-            "why nothing comes: what is wrong with the shell, the graph or a bag, and what to do",
+            "find out why nothing arrives: check the shell, the graph or a bag",
         ),
-        Command("compile", "body_tracking.compilation", "compile the loops over images ahead of the first one"),
+        Command("compile", "body_tracking.compilation", "compile the image processing in advance"),
     ),
 )

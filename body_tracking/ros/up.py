@@ -108,10 +108,10 @@ def options_for(args: argparse.Namespace) -> Options:
     if args.record is not None and args.record.exists() and (not args.record.is_dir() or any(args.record.iterdir())):
         raise UpError(f"{args.record}: exists already; a recording needs a new folder")
     if args.external and args.bag is not None:
-        raise UpError("external: a bag is played in place of the sensors; give one of the two")
+        raise UpError("external: cannot be combined with a bag, which is played in place of the sensors")
     if args.bag is None:
         if args.rate != 1.0:
-            raise UpError("rate is that of a bag; name the bag, too")
+            raise UpError("rate: needs a bag")
     else:
         if not 0.01 <= args.rate <= 100.0:
             raise UpError(f"rate {args.rate:g}: expected 0.01 to 100")
@@ -467,7 +467,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         epilog="Without --bag the parameters file says what each sensor node reads, under its name <sensor>_skeleton.",
     )
     add_options(parser)
-    parser.add_argument("--log-dir", type=Path, metavar="FOLDER", help="for logs (default: where ROS keeps them)")
+    parser.add_argument("--log-dir", type=Path, metavar="FOLDER", help="folder for logs (default: that of ROS)")
     parser.set_defaults(run=run)
 
 

@@ -197,31 +197,35 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="sensors at these angles from the person's front instead, degrees, positive to the person's left: "
         "--around=45,-45,135,-135",
     )
-    command.add_argument("--people", type=int, default=1, metavar="N", help="side by side (default: 1)")
     command.add_argument(
-        "--crossing", action="store_true", help="people walk past each other and hide each other, whatever the motion"
+        "--people", type=int, default=1, metavar="N", help="number of people, side by side (default: 1)"
+    )
+    command.add_argument(
+        "--crossing", action="store_true", help="people walk past and hide each other; --motion has no effect"
     )
     command.add_argument(
         "--imus", default="", metavar="SEGMENT,...", help="segments of the first person with an inertial sensor"
     )
     command.add_argument("--raw", action="store_true", help="inertial sensors report no orientation")
-    command.add_argument("--imu-rate", type=float, default=100.0, metavar="HZ", help="of each (default: 100)")
-    command.add_argument("--no-magnetometer", action="store_true", help="inertial sensors have none")
+    command.add_argument(
+        "--imu-rate", type=float, default=100.0, metavar="HZ", help="rate of each inertial sensor (default: 100)"
+    )
+    command.add_argument("--no-magnetometer", action="store_true", help="inertial sensors have no magnetometer")
     command.add_argument(
         "--seconds",
         type=float,
         metavar="S",
-        help="of the recording, by more repetitions (default: the motion's own length)",
+        help="length of the recording, by repeating the motion (default: one repetition)",
     )
     command.add_argument("--seed", type=int, default=0, metavar="N", help="of the random generators (default: 0)")
-    command.add_argument("--dark", action="store_true", help="without light a sensor takes 15 frames a second")
+    command.add_argument("--dark", action="store_true", help="no light: a sensor takes 15 frames a second")
     command.add_argument(
         "--config",
         type=Path,
         metavar="FILE",
-        help="errors of the sensors, as in config/simulator.yaml (default: these)",
+        help="errors of the sensors (default: those of config/simulator.yaml)",
     )
-    command.add_argument("--overwrite", action="store_true", help="replace BAG if it is there")
+    command.add_argument("--overwrite", action="store_true", help="replace an existing BAG")
     command.set_defaults(run=run)
 
     bags = subparsers.add_parser(

@@ -254,7 +254,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the person and the noise")
     parser.add_argument("--boards", type=int, default=0, metavar="N", help="also N views of a chessboard, in FOLDER")
     parser.add_argument("--wand", type=int, default=0, metavar="N", help="also N places of a wand, as FOLDER/wand")
-    parser.add_argument("--overwrite", action="store_true", help="replace OUT if it is there")
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing OUT")
     parser.set_defaults(run=run)
 
 

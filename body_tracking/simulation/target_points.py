@@ -73,7 +73,7 @@ def random_rotation(rng: np.random.Generator) -> FloatArray:
 def random_targets(
     rng: np.random.Generator, count: int, balls: int = 5, extent: float = 0.098, noise: float = 8e-4
 ) -> list[Target]:
-    """Targets whose balls are at least 25 mm apart, not flat, and which can be told apart at a noise (metres)."""
+    """Targets whose balls are at least 25 mm apart, not flat, and which can be distinguished at a noise (metres)."""
     targets: list[Target] = []
     while len(targets) < count:
         points = rng.uniform(-1.0, 1.0, (balls, 3))

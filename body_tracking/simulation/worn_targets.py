@@ -50,7 +50,7 @@ class WornTargets:
     world: FloatArray
 
     def until(self, seconds: float) -> WornTargets:
-        """Only what is measured in the first seconds."""
+        """Only the measurements of the first seconds."""
         count = int(np.searchsorted(self.times, self.times[0] + seconds))
         return replace(self, times=self.times[:count], rotations=self.rotations[:count])
 

@@ -32,7 +32,7 @@ SYSTEM = System(
     ),
     specs=_specs,
     options=(
-        Option("viewer", False, "show it on a live page in a browser, and take its buttons", example=True),
+        Option("viewer", False, "show the graph on a live page in a browser", example=True),
         Option("markers", False, "publish markers for RViz and Foxglove", example=True),
     ),
     topics=(
@@ -41,8 +41,8 @@ SYSTEM = System(
             MARKERS,
             RELIABLE,
             "body_markers",
-            "what the sensors see, the fused and the filtered skeleton, 95 % ellipsoids of its joints, and the "
-            "sensors, in `world`",
+            "in `world`: the sensors and their skeletons, the fused and the filtered skeleton, 95 % ellipsoids of its "
+            "joints",
         ),
         TopicSpec(
             graph.TF,

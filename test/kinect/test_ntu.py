@@ -98,7 +98,7 @@ def test_a_file_cut_anywhere_is_refused_or_read_up_to_its_last_whole_frame(tmp_p
         (lambda lines: [*lines[:9], "1 2 3", *lines[10:]], "line 10: 3 values of a joint"),
         (lambda lines: [*lines[:9], lines[9].replace("1036.6", "x"), *lines[10:]], "line 10: not a number .*'x'"),
         (lambda lines: [*lines[:9], lines[9][:-1] + "3", *lines[10:]], "line 10: tracking state 3"),
-        (lambda lines: [*lines, "1"], "goes on after the last of 2 frames"),
+        (lambda lines: [*lines, "1"], "continues after the last of 2 frames"),
     ],
 )
 def test_errors_name_the_line(tmp_path, change, text):

@@ -199,7 +199,7 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "the first angle twice": ({"order": [0, 0, 1, 2]}, TWICE),
     "another convention": (
         {"convention": "isb", "pose": [-1.0, 0.0, 0.8]},
-        "angles are of the convention 'isb', the mapping is about 'positional'",
+        "angles are of the convention 'isb', the mapping needs 'positional'",
     ),
     "no convention": ({"convention": ""}, "no convention (an empty frame_id)"),
     "no angles": ({"silent": True}, "no new angles for"),
@@ -313,7 +313,7 @@ def test_a_standstill_of_the_commands_holds_or_stops_at_once_and_is_not_made_up_
     bench.elapsed_ns += round(seconds * NANOSECONDS)
     after = bench.run()
     assert after.state == state
-    late = f"the commands themselves stood still for {seconds + PERIOD:.2f} s"
+    late = f"gap in the commands of {seconds + PERIOD:.2f} s"
     assert (late in after.reason) == (state != State.FOLLOWING)
     if state == State.STOPPED:
         assert after.position is None  # not even the last command is repeated

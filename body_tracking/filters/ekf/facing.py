@@ -55,9 +55,9 @@ class Facing:
             skeleton: in the state's frame of reference.
 
         Returns:
-            The state with what the frame says of it, and the same frame where both have the same sense, no source
-            speaks, or the state is doubted; else with left and right of the upper body, the lower, or both exchanged,
-            or without these where they are seen across.
+            The updated state and the frame. The frame is unchanged if both have the same sense, no source is
+            informative, or the state is doubted; else left and right of the upper body, the lower body or both are
+            swapped, or removed where their axis is across the state's.
         """
         speaking = state.stamp_ns - state.sources.stamps < _SPEAKING_NS
         if not speaking.any():

@@ -151,7 +151,7 @@ class ExtendedKalmanFilter:
         self._state = self._poses.new_state(stamp_ns, q, lengths, stddev, None)
 
     def update(self, skeleton: Skeleton, sensor: str = "") -> Skeleton | None:
-        """Take one frame, and say what it shows: :meth:`take` and then :attr:`filtered`.
+        """Take one frame and return the filtered skeleton: :meth:`take`, then :attr:`filtered`.
 
         Returns:
             None where the frame is a repetition, came late, or shows no trunk yet.

@@ -88,12 +88,12 @@ class EkfParameters(OrientationParameters):
     settle_time: float = number_field(60.0, "at the latest lengths stay as they are from this time on", "s", 0.1, 1e5)
     late_window: float = number_field(0.2, "frames that come late by no more than this still count", "s", 0.0, 2.0)
     predict_for: float = number_field(
-        2.0, "without any measurement for longer than this the person is lost", "s", 0.0, 60.0
+        2.0, "a person without any measurement for longer than this is lost", "s", 0.0, 60.0
     )
 
     posture: bool = field(
         default=True,
-        metadata={"doc": "posture prior for directions that points do not show, such as how the spine shares a bend"},
+        metadata={"doc": "use a posture prior for what points do not show, such as how the spine shares a bend"},
     )
     t_pose: bool = field(default=True, metadata={"doc": T_POSE})
 

@@ -1,4 +1,4 @@
-"""What frames of cameras say."""
+"""Updates by frames of cameras."""
 
 from __future__ import annotations
 

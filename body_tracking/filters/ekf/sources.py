@@ -218,7 +218,7 @@ class Sources:
         )
 
     def with_new(self, measurement: SegmentOrientation, parameters: OrientationParameters) -> tuple[Self, FloatArray]:
-        """With one more, the last, and (7, 7) the covariance of what is known of it."""
+        """With one more source at the end, and the (7, 7) prior covariance of its states."""
         slow_variance = _slow_variance(measurement.covariance, parameters)
         stated = _stated(measurement.covariance, parameters)
         covariance = np.zeros((PER_SOURCE, PER_SOURCE))
@@ -266,11 +266,11 @@ class Sources:
     def restated(
         self, number: int, measurement: SegmentOrientation, parameters: OrientationParameters
     ) -> tuple[Self, FloatArray, FloatArray] | None:
-        """After a source has come to state another variance of itself.
+        """After a source has changed the variance that it states.
 
-        Where it states a greater one, b instead of a, what it errs by has walked on: b - a is added. Where it states a
-        smaller one it has corrected itself, and of an error e of variance a there is left (b / a) e, and what is new
-        with variance b (1 - b / a): the regression of an optimal estimate's error on the one before.
+        If it grows from a to b, the error is a random walk: b - a is added. If it shrinks, the source has corrected
+        itself: of an error e of variance a, (b / a) e is left, and a new one of variance b (1 - b / a) is added: the
+        regression of an optimal estimate's error on the one before.
 
         Returns:
             What is known, (4,) what is left of the errors of misalignment and heading, and (4,) rad2 that are new; None
@@ -339,12 +339,12 @@ def slipped(covariance: FloatArray, own: slice, parameters: OrientationParameter
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Expected:
-    """An orientation against what was expected of it.
+    """A measured orientation compared with its prediction.
 
     Attributes:
         innovation: (3,) radians about the axes of world, Log(R_m R_p^T).
-        by_tangent: (3, 32) what a change of the configuration's tangent takes from it.
-        by_source: (3, 7) what a change of the source's numbers takes from it.
+        by_tangent: (3, 32) minus its derivative by the configuration's tangent.
+        by_source: (3, 7) minus its derivative by the source's states.
     """
 
     innovation: FloatArray
@@ -360,7 +360,7 @@ def expect(
     measured: FloatArray,
     correction: FloatArray | None = None,
 ) -> Expected:
-    """What a source is expected to say, equation (1), against what it said.
+    """The innovation of a source's orientation against equation (1), and its derivatives.
 
     Args:
         model: the body.

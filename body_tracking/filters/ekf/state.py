@@ -88,7 +88,7 @@ class SensorState(Changeable):
         slow: (2,) scales of the slow variance: of points by themselves, of limbs.
         slow_estimate: (2,) their running estimates, of which only significant ones are used.
         slow_information: (2,) of the estimates.
-        stated: it says itself how much it errs, as one that was measured against anatomy does.
+        stated: whether its skeletons bring covariances, which include the systematic error.
     """
 
     stamps: tuple[int, ...]
@@ -193,8 +193,8 @@ class StateSpace:
         size: of the state without any source of orientations (85).
         tangent, lengths, velocities: where these are in the state.
         own: (19, 3, 3) indices of each point's own block in the flat covariance (57, 57) of all.
-        base_variance: (19,) square metres by which a camera that says nothing of it errs.
-        rest_information: (32,) what is known of the tangent without any measurement.
+        base_variance: (19,) square metres, systematic error of a camera that states no variances.
+        rest_information: (32,) prior information on the tangent.
         lengths_covariance: (21, 21) of people's lengths.
         thumbs: (12, 19) the thumb at the end of each segment, of forearms and hands.
     """
