@@ -83,8 +83,8 @@ SYSTEM = System(
         Service(
             "robot_commands/enable",
             "robot_commands",
-            "an operator confirms that the robot is at `home` or where it was left, and may move; in the node's own "
-            "namespace",
+            "an operator confirms that the robot is at `home` or where it was left, and may move; below the node's "
+            "own name",
         ),
     ),
 )
