@@ -272,9 +272,9 @@ class OrientationUpdate:
         """The states of sources that a camera must not correct: axial rotation of forearm or hand.
 
         Except for thumbs (:meth:`without_thumbs`), a camera observes this rotation only by the direction in which an
-        arm is bent, with a small variance and an error that persists as long as the arm looks the same.
-        That combination of a source's numbers is only considered
-        (Schmidt 1966): its gain is zero along the direction in which the source's states vary with it.
+        arm is bent, with a small variance and an error that persists as long as the arm looks the same. That
+        combination of a source's states is only considered (Schmidt 1966): its gain is zero along the direction in
+        which the source's states vary with it.
 
         Returns:
             (n, 85 and more) combinations, and (85 and more, n) what takes them from a correction; None where there are
