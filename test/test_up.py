@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import psutil
 import pytest
-import yaml
 
 from draws import some
 
@@ -26,27 +24,15 @@ from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 
 from body_tracking import cli, systems  # noqa: E402
-from body_tracking.calibration.storage import save  # noqa: E402
 from body_tracking.core.parameters import (  # noqa: E402
-    SECTION,
     ParameterError,
-    Value,
 )
-from body_tracking.core.sensor_poses import CalibrationResult, SensorQuality  # noqa: E402
-from body_tracking.core.skeleton import NANOSECONDS  # noqa: E402
 from body_tracking.messages.base import to_nanoseconds  # noqa: E402
-from body_tracking.messages.cdr import decode_skeletons  # noqa: E402
-from body_tracking.messages.diagnostics import statuses  # noqa: E402
 from body_tracking.node_parameters import parameters_for  # noqa: E402
 from body_tracking.pipeline import graph  # noqa: E402
-from body_tracking.pipeline.people import ALL  # noqa: E402
 from body_tracking.pipeline.roles import ROLES  # noqa: E402
 from body_tracking.pipeline.system import Options  # noqa: E402
-from body_tracking.recording.replay import ReplaySettings, replay  # noqa: E402
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagReader, BagWriter, deserialize  # noqa: E402
-from body_tracking.simulation.bags import write_bag  # noqa: E402
-from body_tracking.simulation.layouts import around  # noqa: E402
-from body_tracking.simulation.scene import Setup, lanes, simulate  # noqa: E402
 from body_tracking.systems import options_of  # noqa: E402
 from domains import domain  # noqa: E402
 from spinning import spin_until  # noqa: E402
@@ -55,9 +41,6 @@ BAGS = Path(__file__).resolve().parent.parent / "bags"
 BAG = BAGS / "tpose_wave"
 ANGLES = graph.joint_states_topic("body1")
 STDDEVS = graph.joint_states_stddev_topic("body1")
-SAME = 1e-4
-"""Radians by which live and offline may differ: a hundredth of what any angle is known to. They are equal to the last
-bit while both have the same number of BLAS threads; with another number sums round differently (4e-5 rad)."""
 NODES = ("joint_angles", "skeleton_filter", "fusion", "calibration", "bag_recorder", "bag_player")
 
 
@@ -128,133 +111,12 @@ def up(tmp_path: Path) -> Iterator[Callable[..., Up]]:
         each.close()
 
 
-PATIENT: dict[str, dict[str, Value]] = {
-    "calibration": {"activation_delay": 5.0},
-    "fusion": {"max_wait": 1.0},
-    "skeleton_filter": {"order_wait": 1.0, "predict_after": 1000.0},
-}
-"""On a machine with much else to do messages get lost and are sent again: a node may lag behind by so much and gives
-the same as offline."""
-
-
-def patiently(folder: Path) -> tuple[str | Path, ...]:
-    """The same for ``up``: arguments."""
-    file = folder / "parameters.yaml"
-    file.write_text(yaml.safe_dump({node: {SECTION: values} for node, values in PATIENT.items()}))
-    return "--params-file", file
-
-
-def patient(**settings: Any) -> ReplaySettings:
-    """The same for a replay."""
-    return ReplaySettings(("kinect1", "kinect2"), parameters=PATIENT, **settings)
-
-
 def angles_in(path: Path, topic: str) -> dict[int, Any]:
     """Position by capture time, and its names."""
     with BagReader(path) as reader:
         type_name = reader.topics[topic].type_name
         messages = [deserialize(type_name, found.cdr) for found in reader.messages([topic])]
     return {to_nanoseconds(message.header.stamp): np.array(message.position) for message in messages}
-
-
-LATE = re.compile(r"late( ticks| frames)?|missed|lost .+|late_frames")
-"""Counters of a node that say that a message came too late for its results to be those of an offline run."""
-
-
-def late_messages(bag: Path) -> dict[str, str]:
-    """What the last diagnostics of the nodes in a recording say of messages that came too late, or not at all."""
-    found = {}
-    with BagReader(bag) as reader:
-        for raw in reader.messages([graph.DIAGNOSTICS_TOPIC]):
-            for status in statuses(deserialize(reader.topics[graph.DIAGNOSTICS_TOPIC].type_name, raw.cdr)):
-                if status.node in ("calibration", "fusion", "skeleton_filter"):
-                    late = {name: value for name, value in status.values.items() if LATE.fullmatch(name)}
-                    found |= {f"{status.node}: {name}": value for name, value in late.items() if value != "0"}
-    return found
-
-
-def differences(live: Path, offline: Path, topics: Sequence[str]) -> list[str]:
-    """Where the angles of two recordings are not the same; empty for nowhere."""
-    found = []
-    for topic in topics:
-        one, other = angles_in(live, topic), angles_in(offline, topic)
-        if one.keys() != other.keys():
-            found.append(f"{topic}: {len(one.keys() ^ other.keys())} stamps in one of {len(one)} and {len(other)}")
-        apart = {
-            (stamp - min(one)) / NANOSECONDS: (one[stamp], other[stamp])
-            for stamp in sorted(one.keys() & other.keys())
-            if not np.allclose(one[stamp], other[stamp], rtol=0.0, atol=SAME, equal_nan=True)
-        }
-        if apart or not one:
-            found.append(f"{topic}: {len(apart)} of {len(one)} frames, first {next(iter(apart.items()), None)}")
-    return found
-
-
-def live_as_offline(
-    up: Callable[..., Up],
-    folder: Path,
-    arguments: Sequence[str | Path],
-    offline: Path,
-    topics: Sequence[str],
-    calibration: Path | None = None,
-) -> Path:
-    """Play a bag through the live graph, which must give the angles of the offline run; the recording.
-
-    A graph that says in its diagnostics that messages came too late, on a machine that is too busy, plays the bag once
-    more, and slower; one that differs without saying so is wrong.
-    """
-    said: list[object] = []
-    for rate in ("1", "0.5", "0.25"):
-        live = folder / f"live_{rate}"
-        if calibration is not None:
-            shutil.copy(calibration, folder / "live.yaml")  # the node writes its estimate into it
-            arguments = (*arguments, "--calibration", folder / "live.yaml")
-        graph_up = up(*arguments, "--rate", rate, "--record", live, "--reliable", *patiently(folder))
-        assert graph_up.until(lambda run=graph_up: run.process.poll() is not None, timeout=120.0), graph_up.text()
-        assert graph_up.process.returncode == 0, graph_up.text()
-        assert "frames of joint angles" in graph_up.text()
-        assert "XMLPARSER" not in graph_up.text()  # Fast DDS takes a file of profiles as a whole or not at all
-        found = differences(live, offline, topics)
-        if not found:
-            return live
-        said.append((rate, found, late_messages(live)))
-        assert late_messages(live), said
-    raise AssertionError(said)
-
-
-def two_people(folder: Path) -> tuple[Path, Path]:
-    """A simulated recording of two who walk past each other, and the calibration of its sensors."""
-    recording = simulate(
-        Setup(
-            "walking_and_turning",
-            around(np.radians([25.0, -35.0]).tolist(), distances=2.7),
-            number=2,
-            seconds=8.0,
-            standard=True,
-            places=lanes(2),
-        )
-    )
-    write_bag(recording, folder / "people")
-    poses = {sensor.pose.sensor: sensor.pose for sensor in recording.sensors}
-    clocks = {sensor.pose.sensor: sensor.clock for sensor in recording.sensors}
-    quality = {name: SensorQuality(0.03, 0.005, 0.01, 0.002, 500) for name in poses}
-    save(CalibrationResult("kinect1", poses, clocks, quality), folder / "true.yaml")
-    return folder / "people", folder / "true.yaml"
-
-
-def test_two_people_have_angles_of_their_own_the_same_live_and_offline(up: Callable[..., Up], tmp_path: Path) -> None:
-    bag, calibration = two_people(tmp_path)
-    replay(bag, tmp_path / "offline", patient(calibration_file=calibration, more={"subject": ALL, "people": 3}))
-    arguments = ("--bag", bag, "--subject", "all", "--people", "3")
-    topics = [graph.joint_states_topic(body) for body in ("body1", "body2")]
-    live = live_as_offline(up, tmp_path, arguments, tmp_path / "offline", topics, calibration)
-    assert all(len(angles_in(live, topic)) > 100 for topic in topics)
-    with BagReader(live) as reader:
-        assert reader.topics[graph.joint_states_topic("body3")].count == 0
-        numbers = [
-            tuple(each.body for each in decode_skeletons(raw.cdr) or ()) for raw in reader.messages([graph.FILTERED])
-        ]
-    assert numbers.count((1, 2)) > 100 and set(numbers) <= {(1, 2), (1,), (2,)}
 
 
 @pytest.mark.alone
