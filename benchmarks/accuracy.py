@@ -7,8 +7,7 @@ was calibrated with, and most motions are others; nothing here was used to tune 
 methods   ``one sensor``: what kinect1 says, in world; ``thesis ...``: the pipeline of Schlagenhauf (2017)
           (``thesis_pipeline``); ``fused``, ``default`` and ``ekf``: this package at its defaults, offline, through the
           messages of the live graph (calibration, fusion, filter, joint angles). ``offsets alone`` is none: a sensor
-          that is wrong by nothing but where it takes the joints' centres to be, which no method can know. What that
-          leaves after a constant offset of each joint is taken off is what turns with other bones than the anatomist's.
+          that is wrong by nothing but where it takes the joints' centres to be, which no method can know.
 errors    of the ten joints of the thesis's model, in world, at the stamps that each method claims, from when all have
           begun: mean 3D error (mm); the same without each joint's constant offset in the body's own frames ("fixed");
           the latter where a joint is hidden from one sensor or more; RMSE of shoulder elevation and elbow flexion

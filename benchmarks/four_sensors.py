@@ -1,20 +1,13 @@
 """Four sensors of 30 Hz live through the graph: what is lost, what each node costs, and how late its output is.
 
-A person is simulated who twists as in a shipped bag, for as long as it takes, seen by four Kinects that run on clocks
-of their own and deliver after different times, so that many frames come after later ones of other sensors.
-``body_tracking up`` plays them at their times through four sensor nodes, the filter ``ekf`` takes each frame by itself,
-best effort as by default.
+A person is simulated who twists as in a shipped bag, seen by four Kinects that run on clocks of their own and deliver
+after different times, so that many frames come after later ones of other sensors. ``body_tracking up`` plays them at
+their times through four sensor nodes; the filter ``ekf`` takes each frame by itself, best effort as by default.
 
-All is measured from outside: frames by the recording and by what the nodes say in ``/diagnostics``, processor time by
-the system's account of each process over the steady part, delays by the capture stamps of what this process receives.
-Delays count from capture, with the time that the sensor took to deliver (``delay`` in the table of sensors), and from
-delivery, and so include how long the filter lets a frame wait for an older one that is due. One that comes after a
-later one even so has no output of its own: the filter takes the later ones again with it. How many come so depends on
-the recording and on the machine, which holds sensors and filter up; the filter counts them.
-
-The bars: no frame that a sensor delivered is lost or refused, and the filter takes less than 30 % of one core. A filter
-that loses frames works less: what it takes is counted as if it had an output for every one. The bars are meant for a
-machine that does nothing else; the table says what else it did, and what its host took from it.
+All is measured from outside: frames by the recording and by ``/diagnostics``, processor time of each process over the
+steady part, delays by the capture stamps of what this process receives, from capture and from delivery. A frame that
+comes after a later one has no output of its own: the filter takes the later ones again with it. What the filter takes
+is counted as if it had an output for every frame. The bars are meant for a machine that does nothing else.
 """
 
 from __future__ import annotations

@@ -1,24 +1,16 @@
 """One Kinect v2 and two inertial sensors on the wrists against that Kinect alone, on simulated people.
 
-The setting of Jatesiktat et al. (2018). Every run is a person who does one thing in their own way before one Kinect
-that errs like a real one (``calibrate_simulator.py``) and with an inertial sensor on each forearm that errs like a
-consumer's (``simulation.imus``: noise, biases, tissue that gives and follows the twist in part, a driver's own fusion).
-The filter ``ekf`` at its defaults gets the same frames twice: alone, and with the orientations of the forearms. Of
-these it gets only what an alignment would leave: the mounting to ``misalignment_stddev`` and the heading to
-``heading_stddev``, drawn for each sensor; how the sensor errs else, as its driver states it.
+The setting of Jatesiktat et al. (2018): a person before one Kinect that errs like a real one, with an inertial sensor
+on each forearm that errs like a consumer's (``simulation.imus``). The filter ``ekf`` at its defaults gets the same
+frames alone, and with the orientations of the forearms, of which it gets what an alignment would leave: the mounting to
+``misalignment_stddev`` and the heading to ``heading_stddev``, drawn for each sensor. A third row is a Kinect that is
+wrong by nothing but where it takes the joints' centres to be, with the same inertial sensors.
 
-Errors of the joints of both arms in world, at the frames of the Kinect, from a second after the start of the filter:
-mean 3D error (mm) over all frames, and where the joint is hidden from the Kinect by the body; the same without each
-joint's constant offset in the body's own frames ("fixed", as in ``accuracy.py``); RMS error of the forearms' turn
-about their own axes in world and of the model's pronation (degrees), and share of the frames in which the latter lies
-within 1.96 stated standard deviations.
-
-A third row is no Kinect: one that is wrong by nothing but where it takes the joints' centres to be
-(``KinectErrors.offsets_alone``), with the same inertial sensors: about what is in reach of who knows nothing of these.
-
-The rules and defaults for orientations were chosen while looking at the person of seed 1000 in reaching, random,
-arm_raises, punching, hair_combing and standing_still, mostly at an azimuth of 45 degrees, and at those of 4000 and 4001
-in reaching and standing_still. The default takes others.
+Errors of the joints of both arms in world: mean 3D error (mm), also where the joint is hidden from the Kinect by the
+body; without each joint's constant offset in the body's own frames ("fixed"); RMS error of the forearms' turn about
+their own axes in world and of the model's pronation (degrees), and share of the frames in which the latter lies within
+1.96 stated standard deviations. Rules and defaults for orientations were chosen on the people of seeds 1000, 4000 and
+4001; the default takes others.
 """
 
 from __future__ import annotations

@@ -1,20 +1,15 @@
 """Seven inertial sensors and no camera, for ten minutes: the angles of both arms, and what is stated of them.
 
-Chest, pelvis, head, both upper arms and both forearms (the back of the wrist) carry a sensor that errs like a
-consumer's (``simulation.imus``: raw data, noise, biases, scales, straps that are off by 5 degrees per axis, flesh that
-gives and follows the twist in part, a clock of its own each, lost packets, outages). A person takes a T-pose as people
-do, which aligns the sensors, and does one thing of the repertoire over and over. ``imu_skeleton``'s tracker makes
-orientations of the readings in the order of their receipt, and the filter ``ekf`` at its defaults angles of these.
+Chest, pelvis, head, both upper arms and both forearms carry a sensor that errs like a consumer's (``simulation.imus``).
+A person takes a T-pose as people do, which aligns the sensors, and does one thing of the repertoire over and over.
+``imu_skeleton``'s tracker makes orientations of the readings in the order of their receipt, and the filter ``ekf`` at
+its defaults angles of these.
 
 Eight angles, as many as OpenSenseRT judges (Slade et al., IEEE TBME 69 (2022) 664: 5.6 degrees): of both sides the
-rotation of the upper arm against the chest about the chest's three axes (as the model's errors are; Euler angles would
-divide by the sine of an angle that the T-pose makes zero), and the elbow's flexion. Pronation is printed beside them.
-RMS errors in degrees from the end of the first pose on; how the sensors are put on is not known to the tracker.
-
-  with magnetometers in a clean field: RMSE over the eight angles, bar 5.6 deg
-  without: error and stated standard deviation by the minute, and the share of the frames within 1.96 of the latter
-
-What was changed of the library was chosen on seeds below 6000; the default takes others.
+rotation of the upper arm against the chest about the chest's three axes (Euler angles would divide by the sine of an
+angle that the T-pose makes zero), and the elbow's flexion; pronation beside them. RMS errors in degrees from the end of
+the first pose on. With magnetometers in a clean field the RMSE of the eight has a bar, without them the share of the
+frames within 1.96 stated standard deviations. The library was tuned on seeds below 6000; the default takes others.
 """
 
 from __future__ import annotations

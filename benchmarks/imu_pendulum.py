@@ -1,26 +1,18 @@
 """Orientation from raw inertial data against Vicon: a pendulum of three links, 174 s (Szczesna et al. 2016).
 
 Each link carries an inertial sensor, from whose rate, acceleration and magnetic field ``OrientationEstimator`` makes
-orientations, reading by reading; the gyroscopes' range is known. Fitted per link, as published comparisons do: one
-constant rotation from the sensor to the link, one from the earth to Vicon's frame (among them the heading).
+orientations, reading by reading. Fitted per link: one constant rotation from the sensor to the link, one from the earth
+to Vicon's frame. ``total``: RMS of the angle between ours and Vicon's orientation, degrees; ``inclination``: of that
+part whose axis is level; ``stated``: RMS of our own standard deviation; ``joint``: RMS error of the angle about the
+hinge between two links.
 
-- ``total``: RMS of the angle of what is left between ours and Vicon's orientation, degrees; ``inclination``: of that
-  part of it whose axis is level. ``stated``: RMS of our own standard deviation of the same.
-- ``joint``: RMS error of the angle about the hinge between two links.
-
-Vicon's clock wanders against that of the sensors, by the same on each link (the three agree to some milliseconds): its
-frames were laid evenly over the rows, also where the log of the sensors stood still for 0.02 to 0.18 s. At 5 rad/s
-20 ms are 6 degrees. So for each link a course of the offset is estimated from the two other links, from their own rates
-against those of their own Vicon; the link itself has no say in it. ``1 offset`` beside it: the figures by one constant
-offset, of up to 0.1 s, that is fitted to the link itself. The bars are those of the former.
-
-What remains: over 0.3 s the gyroscopes alone differ from Vicon, so aligned, by 0.6, 1.6 and 1.8 degrees RMS (median
-0.3, 0.5 and 0.6); the third is at its stop ten times, for 0.05 to 0.2 s. Another ``tauAcc`` of VQF (1.5 to 12 s) leaves
-inclinations of at least 1.06 and 1.9 degrees on the second and third link, stamps on the sensors' own 20 ms none less.
+Vicon's clock wanders against that of the sensors, by the same on each link: its frames were laid evenly over the rows,
+also where the log of the sensors stood still for 0.02 to 0.18 s. So for each link a course of the offset is estimated
+from the two other links, from their own rates against those of their own Vicon. ``by 1 offset``: by one constant
+offset of up to 0.1 s that is fitted to the link itself. The bars are those of the former.
 
 Left out: Vicon's frames within half a second of where its orientation is none (a quaternion that is not of unit
 length), stands still to the last digit for half a second, or turns by 3 degrees more or less than in the frames around.
-The sensors have no say in that. On the third link, whose markers it swapped at times, these are ``left out``.
 """
 
 from __future__ import annotations

@@ -16,8 +16,6 @@ Rendered images, through detection:
 
 c. rigs calibrated from rendered boards, a target in poses at 1 m: errors after one rigid alignment, which takes away
    what a calibration displaces and turns as a whole.
-
-The exit code is 1 where a bar is missed.
 """
 
 from __future__ import annotations

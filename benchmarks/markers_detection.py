@@ -5,8 +5,6 @@ A camera of 640x480 pixels, f 834 px, balls of 14 mm. ``sd`` is the root mean sq
 of those that are none, ``ms`` is the median CPU time of an image. The categories pool distances of 0.6 to 2.5 m.
 Half overlap: one of two balls hides half of the other. The border cuts off 15 to 50 % of a ball's diameter. A limb
 hides half of a ball.
-
-The exit code is 1 where a bar is missed.
 """
 
 from __future__ import annotations

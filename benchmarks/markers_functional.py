@@ -12,8 +12,6 @@ Poses of clusters by an unweighted fit (Umeyama 1991) of the mean shape, whose m
 - biobuddy (SCoRE and SARA, Ehrig et al. 2006 and 2007) on the same poses, all of them, against our closed form and
   against the maximum likelihood that starts from it: distance of the hip's centre and of the knee's axis (at the centre
   of ours), mm, and the angle of the knee's axis, degrees. Left out where biobuddy is not installed.
-
-The exit code is 1 where a bar is missed.
 """
 
 from __future__ import annotations

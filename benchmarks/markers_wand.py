@@ -5,8 +5,6 @@ calibrated by 13 boards of their own (noise of 0.06 pixels). A wand of 0.45 m wi
 sighting in a hundred wrong) is waved in the middle. The poses to the first camera are compared with the true ones:
 RMS of turn and translation (3D), the share of errors within 1.96 stated deviations, and the RMS of errors over stated
 deviations; with the lenses' covariance as a prior, as ``markers wand`` has it, and with the lenses held as they are.
-
-The exit code is 1 where a bar is missed.
 """
 
 from __future__ import annotations

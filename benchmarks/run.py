@@ -76,7 +76,6 @@ BENCHMARKS = {
     "calibrate_simulator": Benchmark(1),
     "simulated_pairs": Benchmark(4, PAIRS),
     "markers_detection": Benchmark(2),
-    "markers_targets": Benchmark(3),
     "markers_functional": Benchmark(1, recordings("marker_functional")),
     "markers_accuracy": Benchmark(10, options="--calibrations 10"),
     "markers_wand": Benchmark(1),

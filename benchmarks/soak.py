@@ -2,18 +2,12 @@
 
 ``body_tracking up`` plays a simulated recording of a person with two Kinects (and, with ``--imus``, inertial sensors)
 again and again, and records. At each beginning stamps jump back, and every node starts anew. Once a minute the recorder
-closes its bag by its service, the bag is deleted, and the next one begins.
+closes its bag by its service, the bag is deleted, and the next one begins. At the end every node is killed once.
 
 Memory is the private part of each process (USS), which others that share its libraries cannot change. Latency is from
-the writer's time of a reference sensor's frame to that of the angles with its stamp, both by this machine's clock and
-both noted by the middleware, so that nothing depends on how busy the listener is. The rate is what the player reached:
-it sends everything, later if need be.
-
-The bars: the private memory of no process grows by more than 5 % from the second minute to the last tenth, no process
-dies by itself, and the median latency of the last tenth is that of the first one after the first minute, within a
-fifth. The graph must keep up for the last one to mean something: the table says at which rate it ran, what share of the
-frames came through, and what else the machine did. At the end every node is killed once, and must be there again, with
-angles coming.
+the writer's time of a reference sensor's frame to that of the angles with its stamp, both noted by the middleware. The
+rate is what the player reached: it sends everything, later if need be. The graph must keep up for the latency to mean
+something: ``rate`` and ``taken_percent`` say so.
 """
 
 from __future__ import annotations

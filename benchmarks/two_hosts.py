@@ -1,23 +1,14 @@
 """Two Kinects on one computer, the graph on another, and a bad network between them: angles, stamps and recovery.
 
 A person is simulated before two Kinects. ``kinect_sender --replay`` streams each of them from a host of its own to a
-host with the graph of ``body_tracking up``, through a relay that loses packets, holds each of them up
-for another time, and cuts the link for a while. The hosts are network namespaces; the clock that the senders go by is
-shifted by a time namespace. The graph starts with the true poses of the sensors and, since the stamps of both are to be
-in its own clock, with no difference between their clocks. Needs root, or a system that lets users make namespaces;
-every interface and namespace ends with the processes.
+host with the graph of ``body_tracking up``, through a relay that loses packets, holds each of them up for another time,
+and cuts the link for a while. The hosts are network namespaces, the senders' clock is shifted by a time namespace:
+this needs root, or a system that lets users make namespaces. The graph starts with the true poses of the sensors.
 
-The angles are compared with those that the same chain makes offline of the same recording: of all of it, and of it
-without the frames that were lost on the way, which shows what the loss alone does. Where the chain's own standard
-deviation of an angle exceeds 15 degrees in one of them, nothing is compared; nor from the beginning of the cut until a
-second after its end. The time of each capture is known, so are the errors of the stamps; the delay of the fastest
-frame, which no receiver can know, is subtracted.
-
-The bars: the angles are as far from those of the recording as the loss alone puts them, and half a degree more at most
-(RMS of each; a quarter of a degree more all together); angles come again within a second after the link is back, and
-are as far off as those before the cut; no process was started again, and each sender needed one session; stamps err by
-no more than half the jitter. The graph runs with ``--reliable``, so that nothing is lost beside the network; where the
-machine has too much to do, late frames are another matter.
+The angles are compared with those that the same chain makes offline of the whole recording, and of the frames that
+came, which shows what the loss alone does; not where a standard deviation exceeds 15 degrees, nor from the beginning of
+the cut until a second after its end. Errors of stamps are counted less their median: no receiver can know the delay of
+the fastest frame.
 """
 
 from __future__ import annotations

@@ -1,13 +1,11 @@
 """What the viewer costs the graph: the delay from capture to joint angles with it, beside the delay without it.
 
-The graph of benchmarks/latency.py with two sensors of 30 Hz runs all the time. Stretches in which nobody looks and no
-viewer runs alternate with stretches in which the viewer runs and a real browser (headless Chromium) shows it; the
-figures are ratios between these, of one run. Delays are from just before a frame is published until its angles are
-received, by one clock, in one process. The viewer runs as ``body_tracking up`` starts it, in a session of its own.
+The graph of benchmarks/latency.py with two sensors of 30 Hz runs all the time. Stretches in which no viewer runs
+alternate with stretches in which the viewer runs, in a session of its own, and a real browser (headless Chromium) shows
+it. Delays are from just before a frame is published until its angles are received, by one clock, in one process.
 
-The browser has no graphics card here and draws in software; on a desk it would not share the graph's processors, or
-draw on the card. So it draws few pixels (``--sharpness``) and yields to everybody else; how much of a processor it
-still took, the last line says.
+The browser has no graphics card here and draws in software. So it draws few pixels (``--sharpness``) and yields to
+everybody else; ``cpu_percent`` says how much of a processor it still took.
 """
 
 from __future__ import annotations

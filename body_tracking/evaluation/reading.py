@@ -245,11 +245,9 @@ def read_joint_states(bag: BagReader, topic: str, body: str) -> AngleSeries | No
     Returns:
         A series with zero standard deviations and names without the body's id; None without messages.
     """
-    if topic not in bag.topics or bag.topics[topic].type_name != JOINT_STATE:
-        return None
     names: tuple[str, ...] = ()
     rows: dict[int, FloatArray] = {}
-    for raw in bag.messages([topic]):
+    for raw in _messages(bag, topic, JOINT_STATE):
         message = deserialize(JOINT_STATE, raw.cdr)
         names = names or tuple(message.name)
         if tuple(message.name) == names and len(message.position) == len(names):
@@ -274,10 +272,8 @@ def _with_stddev(values: AngleSeries, deviations: AngleSeries | None) -> AngleSe
 
 def read_frames(bag: BagReader, topic: str) -> dict[int, tuple[Skeleton, ...]]:
     """The bodies of a topic's messages by stamp, in time order; malformed messages are left out."""
-    if topic not in bag.topics or bag.topics[topic].type_name != POINT_CLOUD:
-        return {}
     frames = {}
-    for raw in bag.messages([topic]):
+    for raw in _messages(bag, topic, POINT_CLOUD):
         try:
             skeletons = decode_skeletons(raw.cdr) or cloud_to_skeletons(deserialize(POINT_CLOUD, raw.cdr))
         except MessageError:
@@ -448,5 +444,6 @@ def _sensors(bag: BagReader, pose_topic: str, clock_topic: str) -> dict[str, Sen
 
 
 def _messages(bag: BagReader, topic: str, kind: str) -> Iterator[RawMessage]:
+    """A topic's messages; none where it is missing or of another type."""
     there = topic in bag.topics and bag.topics[topic].type_name == kind
     return bag.messages([topic]) if there else iter(())

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import lru_cache
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -42,23 +43,13 @@ def project(points: FloatArray) -> tuple[FloatArray, FloatArray]:
     return pixels, by_camera @ ROTATIONS[:, None]
 
 
-def triangulate(pixels: FloatArray) -> FloatArray:
-    """(n, 3) points by the linear method (Hartley and Sturm 1997, section 5.1), from pixels (2, n, 2).
-
-    Gaschler (2011): eq. 3.4-3.5.
-    """
-    flat = pixels / _FOCAL
-    poses = np.concatenate([ROTATIONS, TRANSLATIONS[..., None]], axis=2)
-    rows = flat[..., None] * poses[:, None, 2:] - poses[:, None, :2]
-    rows = rows.transpose(1, 0, 2, 3).reshape(-1, 4, 4)
-    homogeneous = np.linalg.svd(rows)[2][:, -1]
-    return np.asarray(homogeneous[:, :3] / homogeneous[:, 3:], dtype=np.float64)
-
-
 def measure(true: FloatArray, rng: np.random.Generator, stamp_ns: int = 0, pixel_noise: float = PIXEL_NOISE) -> Points:
-    """Noisy points with their covariance, in the order of the true ones."""
+    """Noisy points with their covariance, in the order of the true ones: linear (Gaschler eq. 3.4-3.5)."""
     pixels, _ = project(true)
-    positions = triangulate(pixels + rng.normal(0.0, pixel_noise, pixels.shape))
+    poses = np.concatenate([ROTATIONS, TRANSLATIONS[..., None]], axis=2)
+    flat = (pixels + rng.normal(0.0, pixel_noise, pixels.shape)) / _FOCAL
+    homogeneous = np.asarray(cv2.triangulatePoints(*poses, *flat.swapaxes(1, 2)), dtype=np.float64)
+    positions = (homogeneous[:3] / homogeneous[3]).T
     _, jacobian = project(positions)
     information = np.einsum("cnij,cnik->njk", jacobian, jacobian) / pixel_noise**2
     covariance = np.linalg.inv(information)
