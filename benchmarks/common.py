@@ -208,6 +208,7 @@ def tables(figures: Any, title: str = "") -> Iterator[str]:
     """Lines that show plain figures (of JSON): mappings of values as rows of a table, what is deeper below titles."""
     if isinstance(figures, list):
         figures = {str(number): each for number, each in enumerate(figures, 1)}
+    figures = {name: each for name, each in figures.items() if each != {}}
     deep = {name: each for name, each in figures.items() if not _is_value(each)}
     if values := {name: each for name, each in figures.items() if name not in deep}:
         yield f"{title}{': ' * bool(title)}{', '.join(f'{name} {_cell(each)}' for name, each in values.items())}"

@@ -59,7 +59,7 @@ def markers(path: Path) -> dict[str, FloatArray]:
     return dict(zip(labels, 1e-3 * np.moveaxis(file["data"]["points"][:3], 0, -1), strict=False))
 
 
-def cluster(trial: dict[str, FloatArray], names: tuple[str, ...], noise: float = NOISE) -> list[TargetPose]:
+def cluster(trial: dict[str, FloatArray], names: tuple[str, ...]) -> list[TargetPose]:
     """The poses of a target of these markers, whose shape is the mean one (Umeyama 1991, eq. 39-42)."""
     points = np.stack([trial[name] for name in names], axis=1)
     centre = points.mean(axis=1, keepdims=True)
@@ -79,7 +79,7 @@ def cluster(trial: dict[str, FloatArray], names: tuple[str, ...], noise: float =
         by_pose[:, 0, 4], by_pose[:, 0, 5] = z, -y
         by_pose[:, 1, 3], by_pose[:, 1, 5] = -z, x
         by_pose[:, 2, 3], by_pose[:, 2, 4] = y, -x
-        information += by_pose.swapaxes(-1, -2) @ by_pose / noise**2
+        information += by_pose.swapaxes(-1, -2) @ by_pose / NOISE**2
     covariance = np.linalg.inv(information)
     name, seen = "_".join(names), np.arange(len(names))
     return [

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from body_tracking.evaluation import reference_report
-from body_tracking.evaluation.comparison import evaluate
+from body_tracking.evaluation.comparison import Evaluation, evaluate
 from body_tracking.evaluation.estimated_segments import read_segments
 from body_tracking.evaluation.marker_reference import (
     is_marker_reference,
@@ -14,10 +16,10 @@ from body_tracking.evaluation.marker_reference import (
     read_marker_reference,
     save_mountings,
 )
-from body_tracking.evaluation.pictures import LEGEND, angle_picture, pictures
+from body_tracking.evaluation.pictures import pictures, reference_pictures
 from body_tracking.evaluation.reading import EvaluationError, Recorded, read_estimate, read_markers, read_truth
 from body_tracking.evaluation.reference_comparison import ReferenceEvaluation, evaluate_by_markers
-from body_tracking.evaluation.report import as_json, facts, page, text, write
+from body_tracking.evaluation.report import report_of, write
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rig import RigReader
 
@@ -131,28 +133,26 @@ def _judge_by_markers(args: argparse.Namespace) -> ReferenceEvaluation:
 def run(args: argparse.Namespace) -> int:
     if _by_markers(args):
         judged = _judge_by_markers(args)
-        if args.html is not None:
-            drawn = [(f"Angles, degrees; {LEGEND}", angle_picture(judged.curves))] if judged.angles else []
-            write(args.html, reference_report.page(judged, drawn).encode())
-        lines = f"{reference_report.facts(judged)}\n{reference_report.text(judged)}"
-        _print(args, reference_report.as_json(judged) if args.json else lines)
-        return 0
-    progress = Progress(0, 1000)
-    try:
-        estimate = read_estimate(args.estimate, args.topic, args.body)
-        truth, own_clock = truth_from(args)
-        result = evaluate(estimate, truth, own_clock, lambda share: progress.at(int(1000 * share)))
-    finally:
-        progress.end()
+        report = reference_report.report_of(judged)
+        draw: Callable[[], list[tuple[str, str]]] = partial(reference_pictures, judged.curves)
+    else:
+        result = _compare(args)
+        report, draw = report_of(result), partial(pictures, result)
     if args.html is not None:
-        write(args.html, page(result, pictures(result)).encode())
-    _print(args, as_json(result) if args.json else f"{facts(result)}\n{text(result)}")
-    return 0
-
-
-def _print(args: argparse.Namespace, content: str) -> None:
-    print(content)
+        write(args.html, report.page(draw()).encode())
+    print(report.json() if args.json else f"{report.lines()}\n{report.text()}")
     if not args.json:
         for name, path in (("report", args.html), ("mountings", args.save_mountings)):
             if path is not None:
                 print(f"\n{name}: {path}")
+    return 0
+
+
+def _compare(args: argparse.Namespace) -> Evaluation:
+    progress = Progress(0, 1000)
+    try:
+        estimate = read_estimate(args.estimate, args.topic, args.body)
+        truth, own_clock = truth_from(args)
+        return evaluate(estimate, truth, own_clock, lambda share: progress.at(int(1000 * share)))
+    finally:
+        progress.end()

@@ -135,7 +135,6 @@ class HandEye:
         covariance: (3 k + 5, 3 k + 5): of ``w`` per mounting, in its segment's frame, such that the true one is
             ``exp(w) @ mounting``; of the world likewise, in the world's frame; of the clock. Rows and columns of
             unfitted parameters are zero.
-        scatter: (k, 3, 3) square radians: of the estimate's errors, in the segment's frame.
         residuals: (n, k, 3) radians, eq. 2; NaN where a segment or its target is unknown.
         motion: (3,) radians RMS of all targets about the principal axes of their motion in the rig, largest first.
     """
@@ -145,7 +144,6 @@ class HandEye:
     clock: FloatArray
     middle: float
     covariance: FloatArray
-    scatter: FloatArray
     residuals: FloatArray
     motion: FloatArray
 
@@ -409,9 +407,7 @@ class _Fit:
         moves[np.ix_(free, given)] = -inverse @ information[np.ix_(free, given)]
         covariance = moves @ self.given @ moves.T
         covariance[np.ix_(free, free)] += inverse @ middle[np.ix_(free, free)] @ inverse
-        return HandEye(
-            self.world, self.mountings, self.clock, self.middle, covariance, self.scatter, residuals, self.motion
-        )
+        return HandEye(self.world, self.mountings, self.clock, self.middle, covariance, residuals, self.motion)
 
     def _factors(self, normal: _Normal, residuals: FloatArray, target: int) -> tuple[float, float]:
         """Second derivative of a target's cost in units of its information, and samples per independent sample.

@@ -63,14 +63,19 @@ def pictures(result: Evaluation) -> list[tuple[str, str]]:
     angles = first.named if first.named is not None and not named_are_positional(result) else first.positional
     drawn = [
         (f"Distance of each joint from the truth, mm, {first.name}; white: not known in both", _errors(result)),
-        (f"Angles, degrees, {first.name}; {LEGEND}", angle_picture(angles)),
+        (f"Angles, degrees, {first.name}; {LEGEND}", _angle_picture(angles)),
     ]
     if result.calibration:
         drawn.append(("Calibration over time against the true one", _calibration(result)))
     return drawn
 
 
-def angle_picture(angles: AngleComparison) -> str:
+def reference_pictures(angles: AngleComparison) -> list[tuple[str, str]]:
+    """The same of an evaluation by the marker system, given its angles."""
+    return [(f"Angles, degrees; {LEGEND}", _angle_picture(angles))] if angles.names else []
+
+
+def _angle_picture(angles: AngleComparison) -> str:
     """``data:`` address of a picture of angles beside true ones, without those that the estimate does not state."""
     stated = np.isfinite(angles.stddev)
     figure = _figure(_height(angles.names))

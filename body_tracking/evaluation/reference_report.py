@@ -1,4 +1,4 @@
-"""Writes what :mod:`body_tracking.evaluation.reference_comparison` finds: tables, JSON and a page."""
+"""The report of what :mod:`body_tracking.evaluation.reference_comparison` finds."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.evaluation.reference_comparison import ReferenceEvaluation
 from body_tracking.evaluation.reference_error import Judged
-from body_tracking.evaluation.report import Column, Table, numbered, tables_as_json, tables_as_page
+from body_tracking.evaluation.report import Column, Report, Table, numbered
 
 _NOTE = (
     "difference: RMS of estimate minus reference. reference: its own RMS deviation (poses, calibration, clock, "
@@ -76,8 +76,8 @@ def tables(result: ReferenceEvaluation) -> tuple[Table, ...]:
     return tuple(made)
 
 
-def facts(result: ReferenceEvaluation) -> str:
-    """Facts about the whole recording, a line each."""
+def report_of(result: ReferenceEvaluation) -> Report:
+    """The report of an evaluation by the marker system."""
     estimate, reference, fit = result.estimate, result.reference, result.fit
     seconds = float(estimate.stamps_ns[-1] - estimate.stamps_ns[0]) / NANOSECONDS
     drift, drift_stddev = 1e6 * fit.clock[1], 1e6 * float(np.sqrt(fit.covariance[-1, -1]))
@@ -94,38 +94,21 @@ def facts(result: ReferenceEvaluation) -> str:
         ("world", f"rig to world known to {np.degrees(fit.world_stddev):.2f} deg per axis"),
         ("motion", f"of the targets {first:.0f} deg RMS about one axis, {second:.0f} about a second"),
     ]
-    return "\n".join(f"{name:<9} {value}" for name, value in (*rows, *(("note", note) for note in result.notes)))
-
-
-def text(result: ReferenceEvaluation) -> str:
-    """The tables as text."""
-    return "\n".join(f"\n{each.text()}\n{each.note}" for each in tables(result))
-
-
-def as_json(result: ReferenceEvaluation) -> str:
-    """Facts and tables as JSON; null for NaN."""
-    fit = result.fit
-    return tables_as_json(
-        {
-            "estimate": str(result.estimate.source),
-            "topic": result.estimate.topic,
-            "reference": str(result.reference.source),
-            "convention": result.estimate.convention,
-            "compared_s": numbered(result.seconds),
-            "clock": {
-                "offset_ms": numbered(1e3 * result.offset_s),
-                "stddev_ms": numbered(1e3 * result.clock_stddev),
-                "drift_ppm": numbered(1e6 * fit.clock[1]),
-                "drift_stddev_ppm": numbered(1e6 * float(np.sqrt(fit.covariance[-1, -1]))),
-            },
-            "world_stddev_deg": numbered(float(np.degrees(fit.world_stddev))),
-            "too_poor": [each.name for each in (*result.angles, *result.orientations) if each.too_poor],
-            "notes": list(result.notes),
+    content = {
+        "estimate": str(result.estimate.source),
+        "topic": result.estimate.topic,
+        "reference": str(result.reference.source),
+        "convention": result.estimate.convention,
+        "compared_s": numbered(result.seconds),
+        "clock": {
+            "offset_ms": numbered(1e3 * result.offset_s),
+            "stddev_ms": numbered(1e3 * result.clock_stddev),
+            "drift_ppm": numbered(drift),
+            "drift_stddev_ppm": numbered(drift_stddev),
         },
-        tables(result),
-    )
-
-
-def page(result: ReferenceEvaluation, pictures: list[tuple[str, str]]) -> str:
-    """One self-contained HTML page."""
-    return tables_as_page(f"{result.estimate.source.name}: accuracy by markers", facts(result), text(result), pictures)
+        "world_stddev_deg": numbered(float(np.degrees(fit.world_stddev))),
+        "too_poor": [each.name for each in (*result.angles, *result.orientations) if each.too_poor],
+        "notes": list(result.notes),
+    }
+    facts = (*rows, *(("note", note) for note in result.notes))
+    return Report(f"{estimate.source.name}: accuracy by markers", facts, content, tables(result))

@@ -89,6 +89,74 @@ class Table:
         return Table(self.key, self.title, (*(self.names[row] for row in rows), *groups), columns, self.note)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Report:
+    """The results of an evaluation, to be written.
+
+    Attributes:
+        name: of the estimate.
+        facts: about the whole recording, names and values.
+        content: the same for JSON.
+        tables: all results.
+        hidden: keys of the tables that text leaves out.
+    """
+
+    name: str
+    facts: tuple[tuple[str, str], ...]
+    content: Mapping[str, object]
+    tables: tuple[Table, ...]
+    hidden: frozenset[str] = frozenset()
+
+    def lines(self) -> str:
+        """The facts, a line each."""
+        return "\n".join(f"{name:<9} {value}" for name, value in self.facts)
+
+    def text(self) -> str:
+        """The tables as text."""
+        return "\n".join(f"\n{each.text()}\n{each.note}" for each in self.tables if each.key not in self.hidden)
+
+    def json(self) -> str:
+        """Facts and tables; null for NaN."""
+        by_key = {
+            table.key: {
+                "units": {column.key: column.unit for column in table.columns},
+                "rows": {
+                    name: {key: numbered(value) for key, value in table.row(name).items()} for name in table.names
+                },
+            }
+            for table in self.tables
+        }
+        return json.dumps({**self.content, "tables": by_key}, indent=1)
+
+    def page(self, pictures: Iterable[tuple[str, str]]) -> str:
+        """One self-contained HTML page; ``pictures`` are captions and ``data:`` addresses."""
+        title = html.escape(self.name)
+        shown = "".join(f'<h2>{html.escape(caption)}</h2>\n<img alt="" src="{data}">\n' for caption, data in pictures)
+        return f"""<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><title>{title}</title>
+<style>body {{ max-width: 1250px; margin: auto; }} h2 {{ font: 16px sans-serif; }} img {{ max-width: 100%; }}</style>
+</head><body><h1>{title}</h1>
+<pre>{html.escape(self.lines())}</pre>
+{shown}<pre>{html.escape(self.text())}</pre>
+</body></html>
+"""
+
+
+def report_of(result: Evaluation) -> Report:
+    """The report of an evaluation; its text leaves out named angles that repeat those of the skeletons."""
+    content = {
+        "estimate": str(result.estimate.source),
+        "topic": result.estimate.topic,
+        "truth": str(result.truth.source),
+        "span_s": [numbered(each) for each in result.span],
+        "delay_ms": numbered(1e3 * result.delay),
+        "notes": list(result.notes),
+    }
+    made = tables(result)
+    hidden = [each.key for each in made if each.key.startswith("named") and named_are_positional(result)]
+    return Report(f"{result.estimate.source.name}: accuracy", _facts(result), content, made, frozenset(hidden))
+
+
 def tables(result: Evaluation) -> tuple[Table, ...]:
     """All results as tables."""
     made = [_joint_table(result, comparison) for comparison in result.comparisons]
@@ -178,8 +246,7 @@ def _calibration_table(result: Evaluation) -> Table:
     return Table("calibration", title, tuple(each.sensor for each in found), columns, note)
 
 
-def facts(result: Evaluation) -> str:
-    """Facts about the whole recording, a line each."""
+def _facts(result: Evaluation) -> tuple[tuple[str, str], ...]:
     estimate, truth = result.estimate, result.truth
     first, last = result.span
     length = float(truth.stamps_ns[-1] - truth.stamps_ns[0]) / NANOSECONDS
@@ -196,62 +263,12 @@ def facts(result: Evaluation) -> str:
         rows.append((comparison.name, f"RMS 3D {pooled['rms']} mm; {offset}"))
     if named_are_positional(result):
         rows.append(("angles", "those that the estimate states by name are those of its skeletons"))
-    return "\n".join(f"{name:<9} {value}" for name, value in (*rows, *(("note", note) for note in result.notes)))
-
-
-def text(result: Evaluation) -> str:
-    """The tables as text, without named angles that repeat those of the skeletons."""
-    shown = [each for each in tables(result) if not (each.key.startswith("named") and named_are_positional(result))]
-    return "\n".join(f"\n{each.text()}\n{each.note}" for each in shown)
+    return (*rows, *(("note", note) for note in result.notes))
 
 
 def numbered(value: float) -> float | None:
     """A number for JSON; null for NaN and infinity."""
     return round(float(value), 6) if np.isfinite(value) else None
-
-
-def as_json(result: Evaluation) -> str:
-    """Facts and tables as JSON; null for NaN."""
-    content = {
-        "estimate": str(result.estimate.source),
-        "topic": result.estimate.topic,
-        "truth": str(result.truth.source),
-        "span_s": [numbered(each) for each in result.span],
-        "delay_ms": numbered(1e3 * result.delay),
-        "notes": list(result.notes),
-    }
-    return tables_as_json(content, tables(result))
-
-
-def tables_as_json(content: Mapping[str, object], shown: Iterable[Table]) -> str:
-    """JSON of some facts, and tables under the key ``tables``."""
-    by_key = {
-        table.key: {
-            "units": {column.key: column.unit for column in table.columns},
-            "rows": {name: {key: numbered(value) for key, value in table.row(name).items()} for name in table.names},
-        }
-        for table in shown
-    }
-    return json.dumps({**content, "tables": by_key}, indent=1)
-
-
-def page(result: Evaluation, pictures: Iterable[tuple[str, str]]) -> str:
-    """One self-contained HTML page; ``pictures`` are captions and ``data:`` addresses."""
-    return tables_as_page(f"{result.estimate.source.name}: accuracy", facts(result), text(result), pictures)
-
-
-def tables_as_page(name: str, lines: str, shown_tables: str, pictures: Iterable[tuple[str, str]]) -> str:
-    """One self-contained HTML page of a title, facts, tables and pictures as of :func:`page`."""
-    title = html.escape(name)
-    shown = "".join(f'<h2>{html.escape(caption)}</h2>\n<img alt="" src="{data}">\n' for caption, data in pictures)
-    return f"""<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><title>{title}</title>
-<style>body {{ max-width: 1250px; margin: auto; }} h2 {{ font: 16px sans-serif; }} img {{ max-width: 100%; }}</style>
-</head><body><h1>{title}</h1>
-<pre>{html.escape(lines)}</pre>
-{shown}<pre>{html.escape(shown_tables)}</pre>
-</body></html>
-"""
 
 
 def write(path: Path, content: bytes) -> None:

@@ -18,20 +18,21 @@ _ROUGHEST = -4.0
 """Decades of the smoothing parameter, in sample intervals cubed."""
 
 
-def fill_gaps(values: FloatArray, rate: float, longest: float = LONGEST_GAP) -> FloatArray:
-    """A trajectory with its gaps shorter than ``longest`` filled by cubic splines (Schlagenhauf 2017, section 5.6.3).
+def fill_gaps(values: FloatArray, rate: float) -> FloatArray:
+    """A trajectory with its gaps shorter than 0.2 s filled by cubic splines (Schlagenhauf 2017, section 5.6.3).
 
     A spline goes through all known samples between two longer gaps. The ends are not extrapolated.
 
     Args:
         values: (n, 3), NaN where unknown.
         rate: samples per second.
-        longest: s; a gap of as many missing samples as this holds, or more, is left open.
     """
     filled = values.copy()
     known = np.flatnonzero(np.isfinite(values).all(axis=1))
     missing = np.diff(known) - 1
-    breaks = np.flatnonzero(missing >= rate * longest - 1e-6) + 1  # 20 frames at 100 Hz are 0.2 s in spite of rounding
+    breaks = (
+        np.flatnonzero(missing >= rate * LONGEST_GAP - 1e-6) + 1
+    )  # 20 frames at 100 Hz are 0.2 s in spite of rounding
     for each in np.split(known, breaks):
         if len(each) > 1 and each[-1] - each[0] >= len(each):
             inside = np.arange(each[0], each[-1] + 1)

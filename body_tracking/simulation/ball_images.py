@@ -77,22 +77,17 @@ def half_hidden(seed: int, depth: float, sensor: Sensor) -> Rendered:
     return render(CAMERA, *HERE, ball, DIAMETER, sensor, seed, limbs=[limb])
 
 
-def found(scenes: Sequence[Rendered], which: slice = slice(None)) -> tuple[FloatArray, FloatArray, int, int]:
-    """Errors (n, 2), standard deviations (n, 2), and the numbers of balls that are missed and that are none.
-
-    Args:
-        scenes: rendered.
-        which: of the balls of each scene.
-    """
+def found(scenes: Sequence[Rendered]) -> tuple[FloatArray, FloatArray, int, int]:
+    """Errors (n, 2), standard deviations (n, 2), and the numbers of balls that are missed and that are none."""
     wrong, stated, missed, extra = [], [], 0, 0
     for scene in scenes:
         balls = detect(scene.image)
         distance = np.linalg.norm(balls.pixels[:, None] - scene.centroids, axis=2)
         near = distance < 2.0
-        seen = near.any(axis=0)[which]
+        seen = near.any(axis=0)
         missed += int((~seen).sum())
         extra += int((~near.any(axis=1)).sum())
-        for index in np.arange(near.shape[1])[which][seen]:
+        for index in np.flatnonzero(seen):
             nearest = distance[:, index].argmin()
             wrong.append(balls.pixels[nearest] - scene.centroids[index])
             stated.append(np.sqrt(np.diagonal(balls.covariance[nearest])))

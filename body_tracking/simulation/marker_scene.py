@@ -58,7 +58,6 @@ class MarkerScene:
         times: (n,) seconds.
         rotations: (n, t, 3, 3) and
         translations: (n, t, 3) metres: true poses of the targets in the rig's frame.
-        shoulder: (n, 3, 3) true rotations of the upper arm's target by the shoulder's.
         elbow: (n, 2) radians, flexion and pronation.
         chain: the true joints, exactly known.
     """
@@ -68,7 +67,6 @@ class MarkerScene:
     times: FloatArray
     rotations: FloatArray
     translations: FloatArray
-    shoulder: FloatArray
     elbow: FloatArray
     chain: Chain
 
@@ -112,11 +110,11 @@ class MarkerScene:
         )
 
 
-def stereo_rig(distortion: float = -0.1) -> Rig:
-    """The rig, with a radial distortion k1."""
+def stereo_rig() -> Rig:
+    """The rig."""
     matrix = np.array([[FOCAL, 0.0, WIDTH / 2.0 - 0.5], [0.0, FOCAL, HEIGHT / 2.0 - 0.5], [0.0, 0.0, 1.0]])
     cameras = tuple(
-        Camera(f"{name}_optical_frame", WIDTH, HEIGHT, matrix, np.array([distortion, 0.0, 0.0, 0.0, 0.0]))
+        Camera(f"{name}_optical_frame", WIDTH, HEIGHT, matrix, np.array([-0.1, 0.0, 0.0, 0.0, 0.0]))
         for name in ("left", "right")
     )
     # the right camera stands on the left one's +x, turned about y towards it
@@ -126,9 +124,9 @@ def stereo_rig(distortion: float = -0.1) -> Rig:
     return rig
 
 
-def make_targets(seed: int = 0) -> tuple[Target, ...]:
+def make_targets() -> tuple[Target, ...]:
     """Targets of five balls each, no two alike: the best of some random ones."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     found: list[Target] = []
     for name in SEGMENTS:
         drawn = rng.uniform(-0.5, 0.5, (_TRIALS, 5, 3)) * np.array([1.0, 1.0, 0.45])
@@ -185,10 +183,9 @@ def marker_scene(
     rotations = to_rig @ on_segments @ worn
     upper, lower = (MODEL.coordinate_names.index(name) for name in ("elbow_flexion_left", "forearm_pronation_left"))
     angles = MODEL.difference(MODEL.neutral(), course.q)[:, [upper, lower]]
-    shoulder = rotations[:, 0].transpose(0, 2, 1) @ rotations[:, 1]
     centres = (posture.origins[0, indices] - away) @ to_rig.T + np.array([middle, 0.0, _AWAY])
     chain = _true_chain(rotations[0], translations[0], centres, worn)
-    return MarkerScene(rig, make_targets(), times, rotations, translations, shoulder, angles, chain)
+    return MarkerScene(rig, make_targets(), times, rotations, translations, angles, chain)
 
 
 def _true_chain(rotations: FloatArray, translations: FloatArray, origins: FloatArray, worn: FloatArray) -> Chain:

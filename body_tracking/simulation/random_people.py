@@ -335,11 +335,11 @@ class Truth:
     speeds: FloatArray
 
 
-def capture_times(duration: float, rng: np.random.Generator, rate: float = 30.0, jitter: float = 0.001) -> FloatArray:
-    """(n,) seconds of a sensor's captures, ascending, at a rate in Hz and with a standard deviation of the jitter."""
+def capture_times(duration: float, rng: np.random.Generator, rate: float = 30.0) -> FloatArray:
+    """(n,) seconds of a sensor's captures, ascending, at a rate in Hz and with a jitter of 1 ms."""
     times = np.arange(0.0, duration, 1.0 / rate)
     # stamps are whole nanoseconds
-    moved = times + np.clip(rng.normal(scale=jitter, size=len(times)), -0.3 / rate, 0.3 / rate)
+    moved = times + np.clip(rng.normal(scale=0.001, size=len(times)), -0.3 / rate, 0.3 / rate)
     result: FloatArray = np.round(moved * NANOSECONDS) / NANOSECONDS
     return result
 

@@ -148,13 +148,13 @@ class Truth:
             velocities=self.velocities[instant],
         )
 
-    def estimate(self, instant: int, body: int = 0) -> ModelEstimate:
+    def estimate(self, instant: int) -> ModelEstimate:
         """The state of the body model at an instant, with zero covariance."""
         zero = np.zeros((2 * MODEL.nv, 2 * MODEL.nv))
         return ModelEstimate(
             int(self.stamps_ns[instant]),
             WORLD,
-            body,
+            0,
             self.q[instant],
             self.rates[instant],
             zero,

@@ -61,22 +61,20 @@ def random_rotation(rng: np.random.Generator) -> FloatArray:
     return np.asarray(Rotation.random(random_state=rng).as_matrix())
 
 
-def random_targets(
-    rng: np.random.Generator, count: int, balls: int = 5, extent: float = 0.098, noise: float = 8e-4
-) -> list[Target]:
-    """Targets whose balls are at least 25 mm apart, not flat, and which can be distinguished at a noise (metres)."""
+def random_targets(rng: np.random.Generator, count: int, noise: float = 8e-4) -> list[Target]:
+    """Targets of 98 mm, not flat, of five balls 25 mm apart or more, which can be distinguished at a noise (metres)."""
     targets: list[Target] = []
     while len(targets) < count:
-        points = rng.uniform(-1.0, 1.0, (balls, 3))
+        points = rng.uniform(-1.0, 1.0, (5, 3))
         distances = np.linalg.norm(points[:, None] - points[None], axis=2)
-        points *= extent / distances.max()
-        distances *= extent / distances.max()
-        off = distances[np.triu_indices(balls, 1)]
+        points *= 0.098 / distances.max()
+        distances *= 0.098 / distances.max()
+        off = distances[np.triu_indices(5, 1)]
         widths = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         if off.min() < 0.025 or widths[2] < 0.015:
             continue
         points = points - points.mean(axis=0)
-        target = Target(f"target{len(targets)}", points, np.zeros((3 * balls, 3 * balls)), 0.012)
+        target = Target(f"target{len(targets)}", points, np.zeros((15, 15)), 0.012)
         try:
             check_distinct([*targets, target], noise)
         except TargetsAlikeError:
@@ -128,9 +126,9 @@ def scene(
 
 
 def moving(
-    targets: list[Target], distance: float, rng: np.random.Generator, frames: int, spurious: int, rate: float = 60.0
+    targets: list[Target], distance: float, rng: np.random.Generator, frames: int, spurious: int
 ) -> Iterator[tuple[int, FloatArray, list[tuple[FloatArray, FloatArray]], list[FloatArray]]]:
-    """Frames of targets that swing about a place each and turn: stamps, and the rest as :func:`scene` gives it.
+    """Frames at 60 Hz of targets that swing about a place each and turn: stamps, and what :func:`scene` gives.
 
     Amplitudes of 4 cm at up to 1 Hz and 0.6 rad at up to 1 Hz. One ball of each target is hidden, another one after
     every 20 frames. Half of the spurious points are near the targets, and all of them stay where they are.
@@ -144,7 +142,7 @@ def moving(
     for frame in range(frames):
         if frame % 20 == 0:
             hidden = np.array([rng.integers(len(target.points)) for target in targets])
-        phase = 2.0 * np.pi * frequencies * frame / rate
+        phase = 2.0 * np.pi * frequencies * frame / 60.0
         now, rows, owners = [], [], []
         for index, target in enumerate(targets):
             turned = Rotation.from_rotvec(0.6 * np.sin(phase[index, 0]) * axes[index, 0]).as_matrix() @ poses[index][0]
@@ -161,7 +159,7 @@ def moving(
         for row, source in enumerate(order):
             if owners[source][0] >= 0:
                 assignments[owners[source][0]][owners[source][1]] = row
-        yield round(frame / rate * 1e9), np.array(rows)[order], now, assignments
+        yield round(frame / 60.0 * 1e9), np.array(rows)[order], now, assignments
 
 
 def rotation_error(first: FloatArray, second: FloatArray) -> FloatArray:

@@ -27,6 +27,8 @@ ARM = ("clavicle_left", "upper_arm_left", "forearm_left")
 _FRAME = "left_optical_frame"
 _PLACE_STDDEV = 0.0003
 """Metres; places are not used."""
+_ANGLE_STDDEV = float(np.radians(0.16))
+"""Radians that the marker system states of its angle."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,7 +103,6 @@ def write_targets(
     start_ns: int,
     *,
     names: Sequence[str] | None = None,
-    angle_stddev: float = float(np.radians(0.16)),
 ) -> None:
     """Write poses of the targets, and an angle with its deviation, as the marker system's nodes do.
 
@@ -110,7 +111,6 @@ def write_targets(
         folder: of the bag.
         start_ns: stamp of time 0.
         names: of the targets; those of their segments where None.
-        angle_stddev: radians that the marker system states of its angle.
 
     Raises:
         BagError: the folder exists, or it cannot be written.
@@ -130,7 +130,7 @@ def write_targets(
                 pose = TargetPose(name, stamp_ns, _FRAME, rotation, np.zeros(3), covariance, unseen, float("nan"))
                 bag.write(setup.pose_topic(name), PoseOfTarget(name).encode(pose, BAG_WIRE), stamp_ns)
             turn = so3.rotation_vectors(rotations[-2].T @ rotations[-1])
-            stated = JointAngles(stamp_ns, ("elbow_x",), turn[:1], unknown, np.array([angle_stddev]), unknown)
+            stated = JointAngles(stamp_ns, ("elbow_x",), turn[:1], unknown, np.array([_ANGLE_STDDEV]), unknown)
             both = angles_to_joint_states(stated, setup.BODY, "markers", BAG_MESSAGES)
             for suffix, message in zip(("", "_stddev"), both, strict=True):
                 bag.write_message(f"{angle}{suffix}", message, stamp_ns)

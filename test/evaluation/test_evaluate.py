@@ -18,7 +18,7 @@ from body_tracking.core.skeleton import JOINT_NAMES, N_JOINTS, Skeleton, Trackin
 from body_tracking.evaluation.comparison import Evaluation, evaluate
 from body_tracking.evaluation.metrics import Curve
 from body_tracking.evaluation.reading import read_estimate, read_markers, read_truth
-from body_tracking.evaluation.report import facts, tables, text
+from body_tracking.evaluation.report import report_of, tables
 from body_tracking.messages.skeletons import skeletons_to_cloud
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter
 
@@ -76,7 +76,8 @@ def test_the_report_has_every_table_and_picture_in_one_file(
     report = tmp_path / "report.html"
     assert main(["evaluate", str(replayed_wave), "--truth", str(wave), "--html", str(report)]) == 0
     shown = report.read_text(encoding="utf-8")
-    assert facts(result) in html.unescape(shown) and text(result) in html.unescape(shown)
+    made = report_of(result)
+    assert made.lines() in html.unescape(shown) and made.text() in html.unescape(shown)
     addresses = re.findall(r'<img alt="" src="data:image/png;base64,([A-Za-z0-9+/=]+)">', shown)
     assert [base64.b64decode(each)[:8] for each in addresses] == [b"\x89PNG\r\n\x1a\n"] * 3
     assert "http" not in shown and shown.count("src=") == 3
