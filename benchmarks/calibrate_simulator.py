@@ -182,19 +182,14 @@ def _angles(p: FloatArray) -> FloatArray:
     return np.stack(columns, axis=1)
 
 
-def subjects_of(errors: KinectErrors, count: int) -> list[Subject]:
-    """As many subjects."""
+def table_e1(errors: KinectErrors, count: int) -> FloatArray:
+    """(10, 3) mm: the mean absolute errors of the median subject: hers had no luck or bad luck that we know of."""
     found = []
     for seed in range(count):
-        found.append(subject(seed, errors))
+        found.append(subject(seed, errors).mae())
         print(f"\rtable E.1: subject {seed + 1} of {count} ", end="", file=sys.stderr, flush=True)
     print(file=sys.stderr)
-    return found
-
-
-def table_e1(subjects: Sequence[Subject]) -> FloatArray:
-    """(10, 3) mm: the mean absolute errors of the median subject: hers had no luck or bad luck that we know of."""
-    return np.median([each.mae() for each in subjects], axis=0)
+    return np.median(found, axis=0)
 
 
 def main() -> int:
@@ -205,7 +200,7 @@ def main() -> int:
     parser.add_argument("--write", action="store_true", help="write docs/simulator.md, but for its part on real pairs")
     args = parser.parse_args()
     errors = KinectErrors() if args.config is None else read_errors(args.config)
-    mae = table_e1(subjects_of(errors, args.subjects))
+    mae = table_e1(errors, args.subjects)
     tables = table_4_4(errors, args.subjects)
     text = page(mae, tables, args.subjects)
     common.report(args, {"E.1": mae, "4.4": tables}, lambda: print(text))

@@ -112,7 +112,6 @@ class Outcome:
         back_after: seconds of good data; infinity for never.
         start_back_after: seconds from a wrong start to being back, where good data follow it; NaN elsewhere.
         end_error, end_noise: RMS over the 19 points of the estimate and of the measurements.
-        end_worst: of the worst point.
     """
 
     number: int
@@ -125,7 +124,6 @@ class Outcome:
     excess_at: str
     end_error: float
     end_noise: float
-    end_worst: float
     surprise: float
     surprise_at: str
 
@@ -287,7 +285,6 @@ def run(settings: Settings, number: int) -> Outcome:
         excess_at=f"{NAMES[6 + int(coordinate)]} at {times[frame]:.2f} s",
         end_error=1e3 * common.rms(course.error[last]),
         end_noise=1e3 * common.rms(raw[last]),
-        end_worst=1e3 * float(worst.max()),
         surprise=float(surprise.max()),
         surprise_at=NAMES[int(OBSERVED[surprise.argmax()])],
     )
@@ -335,7 +332,11 @@ def summary(outcomes: list[Outcome]) -> dict[str, Any]:
     }
     worst = {
         f"greatest {name}": {
-            f"run {outcomes[k].number}": {"": columns[name][k], "scenario": outcomes[k].scenario}
+            f"run {outcomes[k].number}": {
+                "": columns[name][k],
+                "at": getattr(outcomes[k], f"{name}_at", ""),
+                "scenario": outcomes[k].scenario,
+            }
             for k in np.argsort(-np.nan_to_num(columns[name], nan=np.inf))[:WORST]
         }
         for name in ("excess", "back_after", "surprise")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from body_tracking.core.skeleton import NANOSECONDS, FloatArray
+from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.evaluation.reference_comparison import ReferenceEvaluation
 from body_tracking.evaluation.reference_error import Judged
 from body_tracking.evaluation.report import Column, Report, Table, numbered
@@ -18,24 +18,22 @@ _OFFSET = "offset: mean difference, and its deviation. change: of the offset fro
 _COVERED = "in 95%: share of differences within 1.96 of the deviation that estimate and reference state."
 
 
-def _degrees(values: list[float]) -> FloatArray:
-    return np.degrees(np.array(values, dtype=np.float64))
+_COLUMNS = {"difference": "measured", "reference": "reference", "error": "error", "from": "low", "to": "high"}
+_OFFSETS = {"offset": "offset", "+-": "offset_stddev"}
+"""Fields of :class:`Judged` by the titles of their columns; the second ones where mountings are known."""
 
 
 def _judged_table(key: str, title: str, rows: tuple[Judged, ...], known: bool, note: str) -> Table:
+    shown = _COLUMNS | (_OFFSETS if known else {}) | {"change": "change"}
     columns = [
-        Column("difference", "difference", "deg", _degrees([row.measured for row in rows])),
-        Column("reference", "reference", "deg", _degrees([row.reference for row in rows])),
-        Column("error", "error", "deg", _degrees([row.error for row in rows])),
-        Column("low", "from", "deg", _degrees([row.low for row in rows])),
-        Column("high", "to", "deg", _degrees([row.high for row in rows])),
+        Column(
+            "difference" if name == "measured" else name,
+            heading,
+            "deg",
+            np.degrees([getattr(row, name) for row in rows]),
+        )
+        for heading, name in shown.items()
     ]
-    if known:
-        columns += [
-            Column("offset", "offset", "deg", _degrees([row.offset for row in rows])),
-            Column("offset_stddev", "+-", "deg", _degrees([row.offset_stddev for row in rows])),
-        ]
-    columns += [Column("change", "change", "deg", _degrees([row.change for row in rows]))]
     if key == "reference_angles":
         columns += [Column("covered", "in 95%", "%", 1e2 * np.array([row.covered for row in rows]))]
     return Table(key, title, tuple(row.name for row in rows), tuple(columns), note)
@@ -51,15 +49,10 @@ def tables(result: ReferenceEvaluation) -> tuple[Table, ...]:
         made.append(_judged_table("reference_angles", title, result.angles, known, note))
     note = f"{_NOTE}\n{_OFFSET if not made else 'Rotations in space: lengths of rotation vectors.'}"
     made.append(_judged_table("reference_orientations", "segment orientations", result.orientations, known, note))
-    residuals = result.fit.residuals
+    residuals, count = result.fit.residuals, len(result.targets)
     columns = (
         Column("residual", "residual", "deg", np.degrees(np.sqrt(np.nanmean((residuals**2).sum(axis=-1), axis=0)))),
-        Column(
-            "mounting_stddev",
-            "mounting",
-            "deg",
-            _degrees([result.fit.mounting_stddev(k) for k in range(len(result.targets))]),
-        ),
+        Column("mounting_stddev", "mounting", "deg", np.degrees([result.fit.mounting_stddev(k) for k in range(count)])),
         Column("known", "frames", "%", 1e2 * np.isfinite(residuals[..., 0]).mean(axis=0)),
     )
     rows = tuple(f"{target} on {result.reference.segments[target]}" for target in result.targets)
