@@ -134,7 +134,9 @@ def match(
     around: IntArray,
     turn_cost: float,
 ) -> Matches:
-    """For each measured point the surface that is nearest and faces the same way, as eq. 17 of the paper weighs it.
+    """For each measured point the surface that is nearest and faces the same way.
+
+    Jatesiktat (2018), eq. 17 and section II-J.
 
     Args:
         points: (n, 3) measured.
@@ -252,7 +254,8 @@ def find_pulls(
 ) -> Pulls:
     """Vertices outside of the silhouette, and in front of what was measured on the person.
 
-    A pixel without a measurement says nothing, and so does one where something else is nearer.
+    Jatesiktat (2018), eq. 6 and 12. A pixel without a measurement says nothing, and so does one where something else is
+    nearer.
 
     Args:
         vertices: (N, 3) posed.

@@ -94,7 +94,7 @@ def personalise(
     starts: Sequence[Pose] | None = None,
     settings: Settings | None = None,
 ) -> Person:
-    """The shape of the person that all images show.
+    """The shape of the person that all images show (Jatesiktat 2018, figure 2 and section III-B, from several images).
 
     Args:
         model: shape space.

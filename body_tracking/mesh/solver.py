@@ -239,7 +239,10 @@ class MeshFitter:
         orientations: Sequence[Orientation] = (),
         joints: JointPoints | None = None,
     ) -> Evaluation:
-        """The energy at a pose with its derivatives; arguments as of :meth:`fit`, with one robust scale, metres."""
+        """The energy (Jatesiktat 2018, eq. 4 and 5) at a pose with its derivatives.
+
+        Arguments are those of :meth:`fit`, with one robust scale, metres.
+        """
         settings, body, model = self.settings, self.body, self.body.model
         posed = body.posed(pose)
         frames = posed.turned @ model.frames
@@ -309,7 +312,7 @@ class MeshFitter:
         return Evaluation(fit, system.gradient)
 
     def _add_angles(self, system: _System, pose: Pose) -> float:
-        """Limits (8) and ordinary postures."""
+        """Limits (Jatesiktat 2018, eq. 8) and ordinary postures."""
         anatomy = self.anatomy
         angles = anatomy.angles(pose.rotations)
         excess = np.maximum(angles.values - anatomy.high, 0.0) + np.minimum(angles.values - anatomy.low, 0.0)
@@ -333,7 +336,7 @@ class MeshFitter:
         return float((weights * between * between).sum() + weight * (shift @ shift))
 
     def _add_orientation(self, system: _System, orientation: Orientation) -> float:
-        """Inertial sensors (9-11), with the whole orientation."""
+        """Inertial sensors (Jatesiktat 2018, eq. 9-11), with the whole orientation."""
         frame = system.frames[orientation.joint]
         off = so3.rotation_vectors(orientation.rotation.T @ frame)
         rows = np.zeros((3, len(system.gradient)))
@@ -393,7 +396,10 @@ class Evaluation:
     gradient: FloatArray
 
     def step(self, damping: float) -> FloatArray:
-        """Levenberg-Marquardt step (16), scaled by the diagonal (Marquardt 1963); turns of at most half a radian."""
+        """Levenberg-Marquardt step (Jatesiktat 2018, eq. 15-16; section II-F), scaled by the diagonal (Marquardt 1963).
+
+        Turns are limited to half a radian.
+        """
         information = self.fit.information.copy()
         diagonal = np.arange(len(information))
         information[diagonal, diagonal] *= 1.0 + damping
