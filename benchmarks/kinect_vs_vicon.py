@@ -5,7 +5,9 @@ Filters run with and without the law of the arms' directions (``calibration.arm_
 out the subject it is tried on; ``--fit`` prints the law of all subjects, which is the shipped one. The table holds the
 median over subjects of their clips' medians, and of these the ratio to the raw skeleton; coverage is the share of
 frames whose error lies within 1.96 of the published standard deviation (linear filters: positional angles; ``ekf``:
-convention ``isb``), and deviation the median of these. Clips whose time warp explains less than 0.9 are left out.
+convention ``isb``), and deviation the median of these. The linear filters' deviations depend on the correlation of
+neighbouring joints' errors (``core.measurement``), which is fitted without that subject, too; ``ekf`` has the shipped
+one. Clips whose time warp explains less than 0.9 are left out.
 
 Angles. Elevation: upper arm against the trunk axis, 0 hanging; flexion: forearm against upper arm, 0 straight. Kinect:
 the lines between the joints, trunk axis from SpineMid to SpineShoulder. Vicon: from joint centres that are computed
@@ -34,6 +36,7 @@ from typing import Any
 
 import common
 import numpy as np
+from scipy.optimize import brentq
 from time_warp import TimeWarp, compare, estimate_warp
 
 from body_tracking.calibration.arm_directions import ArmLaw, corrected_arms, fit_arm_law
@@ -57,6 +60,10 @@ HALF_ELBOW = 0.040
 """Elbow centre from the middle of its lateral marker, m: half the width of a grown person's elbow and of the marker."""
 
 ANGLES = ("elevation", "flexion")
+_NAMES = ("shoulder_elevation_right", "elbow_flexion_right")
+"""The published ones."""
+_EVERY = 30
+"""Every thirtieth frame fits the correlation: errors of frames that follow each other hardly differ."""
 RAW = "raw"
 METHODS: dict[str, tuple[str, bool]] = {
     DEFAULT_FILTER: (DEFAULT_FILTER, True),
@@ -213,8 +220,8 @@ class Filtered:
     stddev: FloatArray
 
 
-def filtered(skeletons: list[Skeleton], name: str) -> Filtered:
-    """Run a filter over skeletons."""
+def filtered(skeletons: list[Skeleton], name: str, of_bones: float) -> Filtered:
+    """Run a filter over skeletons; ``of_bones`` as of ``positional_angles``."""
     chosen = make_filter(name)
     found, angles = [], None
     published, stddev = [], []
@@ -225,8 +232,8 @@ def filtered(skeletons: list[Skeleton], name: str) -> Filtered:
             assert chosen.estimate is not None
             angles = angles_of(chosen.estimate, chosen.model, "isb", angles)
         else:
-            angles = positional_angles(out)
-        columns = [angles.names.index(f"{angle}_right") for angle in ("shoulder_elevation", "elbow_flexion")]
+            angles = positional_angles(out, of_bones)
+        columns = [angles.names.index(name) for name in _NAMES]
         found.append(out)
         published.append(np.abs(np.degrees(angles.position[columns])))  # ISB's elevation is negative
         stddev.append(np.degrees(angles.position_stddev[columns]))
@@ -266,6 +273,8 @@ class Clip:
         folder: of the recordings.
         explained: share of the variance that the warp explains.
         kinect, vicon: (n, 2, 3) directions of upper arm and forearm.
+        skeletons: n, of the Kinect.
+        angles: (n, 2) degrees by Vicon, those of ``ANGLES``; NaN outside its clip.
     """
 
     name: str
@@ -273,6 +282,8 @@ class Clip:
     explained: float
     kinect: FloatArray
     vicon: FloatArray
+    skeletons: list[Skeleton]
+    angles: FloatArray
 
     @property
     def subject(self) -> str:
@@ -282,11 +293,18 @@ class Clip:
 def load(file: Path) -> Clip:
     """The Kinect's file of a clip and its Vicon one, aligned."""
     name = file.name.removesuffix("_kinect.csv.gz")
-    raw, vicon = kinect_arm(kinect_skeletons(file)), vicon_arm(file.with_name(f"{name}_vicon.csv.gz"))
+    skeletons = kinect_skeletons(file)
+    raw, vicon = kinect_arm(skeletons), vicon_arm(file.with_name(f"{name}_vicon.csv.gz"))
     warp = align([raw], vicon, name)
-    directions = sample(warp(raw.times), vicon.times, vicon.directions)
+    at = warp(raw.times)
     return Clip(
-        name, file.parent, warp.explained, raw.directions.reshape(-1, 2, 3), _unit(directions.reshape(-1, 2, 3))
+        name,
+        file.parent,
+        warp.explained,
+        raw.directions.reshape(-1, 2, 3),
+        _unit(sample(at, vicon.times, vicon.directions).reshape(-1, 2, 3)),
+        skeletons,
+        np.stack([sample(at, vicon.times, getattr(vicon, angle)) for angle in ANGLES], axis=1),
     )
 
 
@@ -295,13 +313,47 @@ def law_of(clips: list[Clip]) -> ArmLaw:
     return fit_arm_law([(each.subject, each.kinect, each.vicon) for each in clips])
 
 
-def measure(job: tuple[Clip, ArmLaw]) -> dict[str, Any]:
+def correlation_of(clips: list[Clip]) -> float:
+    """Correlation of a bone's two joints with which the squared errors of both angles are as large as stated.
+
+    The errors are those that the law leaves in a subject whom it was not fitted to. Subjects, and the clips of one,
+    weigh alike.
+    """
+    errors, frames = [], []
+    for clip in clips:
+        law = law_of([each for each in clips if each.subject != clip.subject])
+        corrected = [corrected_arms(each, law) for each in clip.skeletons[::_EVERY]]
+        frames.append(corrected)
+        errors.append(_positional(corrected, 0.0)[0] - clip.angles[::_EVERY])
+    subjects = [each.subject for each in clips]
+    weights = 1.0 / np.array([subjects.count(each) for each in subjects])
+
+    def excess(of_bones: float) -> float:
+        stated = [_positional(each, of_bones)[1] for each in frames]
+        parts = [np.nanmean(e**2 - np.where(np.isnan(e), e, s**2), axis=0) for e, s in zip(errors, stated, strict=True)]
+        return float((weights @ np.array(parts)).sum())
+
+    return float(brentq(excess, 0.0, 0.99, xtol=0.002))
+
+
+def _positional(skeletons: list[Skeleton], of_bones: float) -> tuple[FloatArray, FloatArray]:
+    """(n, 2) degrees of the right arm's ``ANGLES``, and (n, 2) their deviations."""
+    angles = [positional_angles(each, of_bones) for each in skeletons]
+    columns = [angles[0].names.index(name) for name in _NAMES]
+    return tuple(
+        np.degrees([getattr(each, part)[columns] for each in angles]) for part in ("position", "position_stddev")
+    )  # type: ignore[return-value]
+
+
+def measure(job: tuple[Clip, ArmLaw, float]) -> dict[str, Any]:
     """All figures of one clip: per method and angle the agreement and the coverage, and the lag."""
-    clip, law = job
-    skeletons = kinect_skeletons(clip.folder / f"{clip.name}_kinect.csv.gz")
+    clip, law, of_bones = job
+    skeletons = clip.skeletons
     vicon = vicon_arm(clip.folder / f"{clip.name}_vicon.csv.gz")
     corrected = [corrected_arms(each, law) for each in skeletons]
-    outputs = {name: filtered(corrected if with_law else skeletons, own) for name, (own, with_law) in METHODS.items()}
+    outputs = {
+        name: filtered(corrected if with_law else skeletons, own, of_bones) for name, (own, with_law) in METHODS.items()
+    }
     arms = {RAW: kinect_arm(skeletons)} | {name: kinect_arm(each.skeletons) for name, each in outputs.items()}
     warp = align(list(arms.values()), vicon, clip.name)
     figures: dict[str, Any] = {"clip": clip.name, "subject": clip.subject, "explained": warp.explained}
@@ -335,13 +387,16 @@ def main() -> int:
         law = law_of(clips)
         print(np.array2string(law.upper, precision=3, separator=", "))
         print(np.array2string(law.forearm, precision=3, separator=", "))
+        print(f"correlation of a bone's joints {correlation_of(clips):.3f}")
         return 0
     subjects = sorted({each.subject for each in clips})
-    laws = {left_out: law_of([each for each in clips if each.subject != left_out]) for left_out in subjects}
-    rows = common.mapped(measure, [(each, laws[each.subject]) for each in clips], args.jobs)
+    others = {subject: [each for each in clips if each.subject != subject] for subject in subjects}
+    laws = {subject: law_of(each) for subject, each in others.items()}
+    correlations = {subject: correlation_of(each) for subject, each in others.items()}
+    rows = common.mapped(measure, [(each, laws[each.subject], correlations[each.subject]) for each in clips], args.jobs)
     table = {name: {angle: _summary(rows, subjects, name, angle) for angle in ANGLES} for name in (RAW, *METHODS)}
-    figures = {"clips": rows, "table": table}
-    common.report(args, figures, lambda: show(table, len(clips), len(files), subjects))
+    figures = {"clips": rows, "table": table, "correlations": correlations}
+    common.report(args, figures, lambda: show(table, len(clips), len(files), correlations))
     return common.verdicts(args, _bars(table))
 
 
@@ -374,9 +429,10 @@ def _bars(table: dict[str, dict[str, dict[str, Any]]]) -> dict[str, bool]:
     return bars
 
 
-def show(table: dict[str, dict[str, dict[str, Any]]], used: int, of: int, subjects: list[str]) -> None:
+def show(table: dict[str, dict[str, dict[str, Any]]], used: int, of: int, correlations: dict[str, float]) -> None:
     """The table."""
-    print(f"{used} of {of} clips, {len(subjects)} subjects; degrees")
+    print(f"{used} of {of} clips, {len(correlations)} subjects; degrees")
+    print("correlation of a bone's joints without each: " + " ".join(f"{each:.3f}" for each in correlations.values()))
     columns = f"{'RMS':>5} {'of raw':>6} {'debiased':>8} {'bias':>5} {'worst':>5} {'stddev':>6} {'coverage':>8}"
     print(f"{'':<34}{'elevation':^49}   {'elbow flexion':^49}")
     print(f"{'':<34}{columns}   {columns}")

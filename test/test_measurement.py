@@ -6,8 +6,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from body_tracking.core.measurement import BASE_STDDEV, INFERRED_FACTOR, body_heading, joint_stddev, viewing_angle
-from body_tracking.core.skeleton import MIRROR, Joint
+from body_tracking.core.measurement import (
+    BASE_STDDEV,
+    INFERRED_FACTOR,
+    body_heading,
+    joint_correlation,
+    joint_stddev,
+    viewing_angle,
+)
+from body_tracking.core.skeleton import BONES, MIRROR, N_JOINTS, Joint
 from walkers import TRACKED, about_y, walk
 
 BODY = walk(np.zeros(1))[0]
@@ -52,3 +59,15 @@ def test_frames_are_weighed_one_by_one_or_together() -> None:
     states = np.broadcast_to(TRACKED, several.shape[:2])
     assert_allclose(joint_stddev(several, states), [joint_stddev(body, TRACKED) for body in several])
     assert_allclose(joint_stddev(several, states, viewing_angle(several)), joint_stddev(several, states))
+
+
+@pytest.mark.parametrize("of_bones", [0.0, 0.5, 0.86])
+def test_errors_of_joints_are_correlated_less_with_each_bone_between_them(of_bones: float) -> None:
+    correlation = joint_correlation(of_bones)
+    bones = np.full((N_JOINTS, N_JOINTS), np.inf)
+    np.fill_diagonal(bones, 0.0)
+    for parent, child in BONES:  # from the base outwards: a child is as far from all before it as its parent, and one
+        bones[child] = np.minimum(bones[child], bones[parent] + 1.0)
+        bones[:, child] = bones[child]
+    assert_allclose(correlation, of_bones**bones, atol=1e-9)
+    assert np.linalg.eigvalsh(correlation)[0] > 0.0

@@ -109,9 +109,6 @@ degrees and the elbow's flexion by 5; the errors of that real Kinect vary by 3 t
 each of six clips."""
 _AXES_STDDEV = 0.3
 """Radians: standard deviation of the measured thorax's axes against the body's, an upper bound."""
-_OBSERVED = np.array([[False, True, False]] * len(_TRUNK) + [[True, False, True]] * (len(LEARNT) - len(_TRUNK)))
-"""(11, 3) directions (forward, left, up) in which a T-pose determines a joint against its neighbours: not along an arm,
-and for the spine, whose bend differs between people, only sideways."""
 _UNSEEN = 1.0
 """Square metres: variance of a joint that is not seen."""
 
@@ -127,7 +124,6 @@ class Offsets:
     Attributes:
         local: (11, 3) metres from the anatomical to the measured joints, in the frames of the segments.
         covariance: (33, 33) of these.
-        axes: (11, 3, 3) unit vectors, which in the T-pose pointed forward, left and up, in these frames.
         share: largest remaining share of the variance of an arm's angle that offsets cause.
         distance: ``r^T S^-1 r``.
         dimension: its expectation for a T-pose.
@@ -135,7 +131,6 @@ class Offsets:
 
     local: FloatArray
     covariance: FloatArray
-    axes: FloatArray
     share: float
     distance: float
     dimension: int
@@ -259,8 +254,7 @@ def t_pose_offsets(positions: FloatArray, transient: FloatArray) -> Offsets:
     local = np.einsum("jab,jb->ja", frames, offsets)
     blocks = np.einsum("iab,ibjc,jdc->iajd", frames, covariance.reshape(len(LEARNT), 3, len(LEARNT), 3), frames)
     distance = float(residual @ np.linalg.solve(innovation, residual))
-    shown_along = frames.swapaxes(1, 2)
-    return Offsets(local, blocks.reshape(covariance.shape), shown_along, float(left.max()), distance, len(rows))
+    return Offsets(local, blocks.reshape(covariance.shape), float(left.max()), distance, len(rows))
 
 
 def _t_pose(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -473,36 +467,6 @@ class JointCentres:
         offsets *= retained(without)[:, None]
         result = positions.copy()
         result[_MOVED] -= offsets[_MOVED_AS]
-        return result
-
-    def remaining(self, covariances: FloatArray, positions: FloatArray, stamp_ns: int) -> FloatArray:
-        """Covariances of corrected joints, with the right variance of the angles between them.
-
-        The remaining offsets are correlated between joints, which covariances of single joints cannot express: across
-        the arms they are reduced to match the variance of the angles in the T-pose.
-
-        Args:
-            covariances: (25, 3, 3) square metres, of the measured joints.
-            positions: (25, 3) metres.
-            stamp_ns: of both.
-        """
-        known = self.offsets
-        if known is None:
-            return covariances
-        axes = posed(positions, known.axes)
-        if not np.isfinite(axes).all():
-            return covariances
-        mean = np.maximum(covariances[LEARNT].trace(axis1=1, axis2=2) / 3.0, 1e-12)
-        gone = (
-            (1.0 - _TRANSIENT_SHARE)
-            * (1.0 - known.share)
-            * self._progress(self._first_ns, stamp_ns)
-            * retained(positions) ** 2
-        )
-        factors = np.sqrt(1.0 - (gone * np.minimum(1.0, BASE_STDDEV[LEARNT] ** 2 / mean))[:, None] * _OBSERVED)
-        scaling = axes.swapaxes(1, 2) @ (factors[:, :, None] * axes)
-        result = covariances.copy()
-        result[LEARNT] = scaling @ covariances[LEARNT] @ scaling
         return result
 
     def spread(self, positions: FloatArray, stamp_ns: int) -> FloatArray:

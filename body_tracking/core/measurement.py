@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from body_tracking.core.skeleton import BoolArray, FloatArray, Joint, TrackingState
+from body_tracking.core.skeleton import BONES, BoolArray, FloatArray, Joint, TrackingState
 
 # Standard deviation of a Tracked joint of a body that faces the sensor at 2 m, metres. Kinect v2 against markers:
 # trunk and elbows about 20-40 mm, hand tips, thumbs and feet two to three times that (Wang 2015, Napoli 2017,
@@ -35,6 +35,12 @@ BASE_STDDEV: FloatArray = _base_stddev()
 INFERRED_FACTOR = 3.0
 """Factor on the standard deviation of an Inferred joint, which the SDK guesses."""
 
+BONE_CORRELATION = 0.86
+"""Correlation of the errors of the two joints of a bone: a skeleton camera displaces neighbouring joints alike, so that
+bones have better directions than independent joints would give. With it the stated variances of elevation and elbow are
+those of the errors of a Kinect v2 against Vicon that the law of the arms' directions leaves in people whom it was not
+fitted to (``benchmarks/kinect_vs_vicon.py --fit``)."""
+
 _LEFT_ENDS = np.array([Joint.SHOULDER_LEFT, Joint.HIP_LEFT], dtype=np.intp)
 _RIGHT_ENDS = np.array([Joint.SHOULDER_RIGHT, Joint.HIP_RIGHT], dtype=np.intp)
 
@@ -43,6 +49,23 @@ _YAW_FACTOR = np.array([1.0, 1.0, 1.3, 3.2, 3.2])
 """Joint error against the body's yaw to the sensor: table 4.4 of Schlagenhauf 2017 (x1.3 at 60, x3.2 at 90 deg)."""
 
 _REFERENCE_DISTANCE = 2.0
+
+
+def joint_correlation(of_bones: float = BONE_CORRELATION) -> FloatArray:
+    """(25, 25) correlation of the joints' errors, ``of_bones`` to the power of the number of bones between two joints.
+
+    That is the Markov field on the tree of bones: given a joint, the two sides of it are independent. Its inverse has
+    entries on the bones alone.
+
+    Args:
+        of_bones: correlation of the two joints of a bone, from 0 (independent) to less than 1.
+    """
+    ends = np.array(BONES, dtype=np.intp)
+    precision = np.eye(len(Joint))
+    np.add.at(precision, (ends, ends), of_bones**2 / (1.0 - of_bones**2))
+    np.add.at(precision, (ends, ends[:, ::-1]), -of_bones / (1.0 - of_bones**2))
+    correlation: FloatArray = np.linalg.inv(precision).astype(np.float64)
+    return correlation
 
 
 def left_right_axes(positions: FloatArray) -> FloatArray:

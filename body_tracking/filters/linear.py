@@ -301,7 +301,6 @@ class LinearKalmanFilter:
             self.counters["reacquired"] += int((started & rejected).sum())
         used = measured & (~rejected | started)
         slow = (1.0 - self.parameters.white_noise_share) * noise
-        slow = self._centres.remaining(slow, np.where(measured[:, None], positions, np.nan), skeleton.stamp_ns)
         self._slow = np.where(used[:, None, None], slow, self._slow)
         return self._output(skeleton, used)
 

@@ -29,12 +29,13 @@ Kinect's SpineShoulder lies a little above the shoulders: a relaxed clavicle rea
 The signed angles are cut at +-180 deg, where no joint of a person can be (such as an upper arm that points straight at
 the other shoulder); within a person's range of motion they are continuous, but for the singularities below.
 
-Uncertainty: first order in the joint covariances, joints independent of each other. Where an angle is the length of a
-deflection (elbow flexion near 0: it cannot be negative) the error across the fold is added, which is of second order. A
-plane of elevation with the arm at the side and the rotation of a straight or vertical arm are about an axis that the
-positions do not determine: the standard deviation grows like 1/sin, and is infinity where the deflection that gives the
-direction (the elevation, the elbow flexion) is not significant: less than 3.7 of its own standard deviations, which
-noise alone exceeds once in a thousand frames.
+Uncertainty: first order in the joint covariances, with the joints' errors correlated as in
+:func:`~body_tracking.core.measurement.joint_correlation` (a skeleton has covariances of single joints only). Where an
+angle is the length of a deflection (elbow flexion near 0: it cannot be negative) the error across the fold is added,
+which is of second order. A plane of elevation with the arm at the side and the rotation of a straight or vertical arm
+are about an axis that the positions do not determine: the standard deviation grows like 1/sin, and is infinity where
+the deflection that gives the direction (the elevation, the elbow flexion) is not significant: less than 3.7 of its own
+standard deviations, which noise alone exceeds once in a thousand frames.
 
 Velocities are the Jacobian times the joint velocities. A skeleton has no covariance of its velocities; the stated
 deviation is a bound. For a point driven by white acceleration of density q, the velocity variance of a Kalman filter in
@@ -45,10 +46,12 @@ measurements; the bound is the second, with the densities of human movement in `
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
 from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.measurement import BONE_CORRELATION, joint_correlation
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray, Joint, Skeleton
 from body_tracking.kinematics.motion import joint_densities
 
@@ -158,6 +161,7 @@ _USED = np.concatenate([(slots != 0).any(axis=2) for slots in (_B_SLOTS, _D_SLOT
 _B_HEADING, _D_HEADING = (int(np.flatnonzero(column == _N_VECTORS)[0]) for column in (_B_B, _D_AXIS))
 _DENSITIES_SQUARED = 3.0 * joint_densities()[_JOINTS, None] ** 2
 
+_EYE3 = np.eye(3)
 _TINY = 1e-18
 """Square metres below which a squared length is none."""
 _YZX, _ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
@@ -237,13 +241,33 @@ def _dihedral(
     return length * (a * q).sum(axis=0), nn * pq - np_ * nq, gradient, aa, bb
 
 
-def positional_angles(skeleton: Skeleton) -> JointAngles:
+@lru_cache
+def _correlation(of_bones: float) -> FloatArray:
+    """(joints, joints) of the used ones."""
+    return joint_correlation(of_bones)[np.ix_(_JOINTS, _JOINTS)]
+
+
+def _roots(covariances: FloatArray) -> FloatArray:
+    """(joints, 3, 3) Cholesky factors; NaN where a covariance is not finite or not positive definite."""
+    known = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))
+    if not known.all():
+        covariances = np.where(known[:, None, None], covariances, _EYE3)
+    try:
+        roots = np.linalg.cholesky(covariances)
+    except np.linalg.LinAlgError:  # symmetric roots exist for semidefinite ones, too
+        values, axes = np.linalg.eigh(covariances)
+        roots = axes * np.sqrt(values)[:, None, :]
+    return np.where(known[:, None, None], roots, np.nan)
+
+
+def positional_angles(skeleton: Skeleton, of_bones: float = BONE_CORRELATION) -> JointAngles:
     """The angles of ``ANGLE_NAMES`` of one body; see the module's text for their definitions.
 
     The elbow's is that of Schlagenhauf (2017), section 4.3.2: between upper arm and forearm.
 
     Args:
         skeleton: in a frame with z up, usually ``/filtered/skeleton``.
+        of_bones: correlation of the errors of the two joints of a bone; 0 for independent joints.
 
     Returns:
         Angles in radians. An angle that needs an unknown joint, or two joints at the same place, is NaN with an
@@ -258,9 +282,10 @@ def positional_angles(skeleton: Skeleton) -> JointAngles:
         unknown[_N_BETWEEN:] |= singular
         rates, stddev, rate_stddev = np.full(n, np.nan), np.full(n, np.inf), np.full(n, np.inf)
         if skeleton.covariances is not None:
-            covariances = skeleton.covariances[_JOINTS]
-            variances = np.where(_USED, ((jacobian @ covariances) * jacobian).sum(axis=2), 0.0)
-            variance = variances.sum(axis=0)
+            errors = np.where(_USED[:, :, None], jacobian @ _roots(skeleton.covariances[_JOINTS]), 0.0)
+            variances = (errors * errors).sum(axis=2)
+            together = (_correlation(of_bones) @ errors.reshape(len(errors), -1)).reshape(errors.shape)
+            variance = np.maximum((errors * together).sum(axis=(0, 2)), 0.0)
             # Near the fold of an angle that cannot be negative the deflection across is an error of its own size, far
             # from it none; in between it is of second order. With the factor 2 the 95 % band of a straight elbow holds.
             across = variance[n:]

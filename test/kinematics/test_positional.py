@@ -15,6 +15,7 @@ from scipy.linalg import solve_discrete_are
 from scipy.spatial.transform import Rotation
 
 from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.measurement import joint_correlation
 from body_tracking.core.skeleton import MIRROR, N_JOINTS, FloatArray, Joint, Skeleton, TrackingState
 from body_tracking.kinematics.motion import ACCELERATION_DENSITIES, JOINT_CLASSES, joint_densities
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
@@ -173,7 +174,7 @@ def test_the_mirror_exchanges_left_and_right(seed: int) -> None:
 @given(seed=st.integers(0, 10_000))
 @settings(max_examples=draws(10, 30))
 def test_velocities_and_standard_deviations_are_by_the_derivatives_of_the_angles(seed: int) -> None:
-    """Against central differences: J v, and the diagonal of J C J^T."""
+    """Against central differences: J v, and the diagonal of J C J^T, of independent and of correlated joints."""
     rng = np.random.default_rng(seed)
     positions, velocities = bent_pose(seed), rng.normal(size=(N_JOINTS, 3))
     roots = 1e-6 * rng.normal(size=(N_JOINTS, 3, 3))
@@ -181,21 +182,25 @@ def test_velocities_and_standard_deviations_are_by_the_derivatives_of_the_angles
     steps = 1e-6 * np.eye(3 * N_JOINTS).reshape(-1, N_JOINTS, 3)
     ahead, behind = ([positional_angles(skeleton(positions + s * step)).position for step in steps] for s in (1, -1))
     jacobian = wrapped(np.subtract(ahead, behind)).T.reshape(-1, N_JOINTS, 3) / 2e-6
-    found = positional_angles(replace(skeleton(positions, None, velocities), covariances=covariances))
+    found = positional_angles(replace(skeleton(positions, None, velocities), covariances=covariances), of_bones=0.0)
     assert_allclose(found.velocity, np.einsum("ajx,jx->a", jacobian, velocities), rtol=1e-5, atol=1e-6)
     variances = np.einsum("ajx,jxy,ajy->a", jacobian, covariances, jacobian)
+    assert_allclose(found.position_stddev, np.sqrt(variances), rtol=1e-4, atol=1e-13)
+    found = positional_angles(skeleton(positions, 1e-6), of_bones=0.7)
+    variances = 1e-12 * np.einsum("ajx,jk,akx->a", jacobian, joint_correlation(0.7), jacobian)
     assert_allclose(found.position_stddev, np.sqrt(variances), rtol=1e-4, atol=1e-13)
 
 
 def test_a_straight_elbow_keeps_its_band_and_hides_the_rotation() -> None:
     """At the fold: 0 deg is within two stated deviations in 95 % of draws, and the rotation is unknown."""
     rng = np.random.default_rng(3)
-    stddev, count = 0.01, 1200
+    stddev, count, root = 0.01, 1200, np.linalg.cholesky(joint_correlation())
     pose = t_pose()
     elbow, rotation = (ANGLE_NAMES.index(name) for name in ("elbow_flexion_left", "humeral_rotation_left"))
     inside = unknown = 0
     for _ in range(count):
-        angles = positional_angles(skeleton(pose + rng.normal(size=pose.shape) * stddev, stddev))
+        errors = stddev * root @ rng.normal(size=pose.shape)
+        angles = positional_angles(skeleton(pose + errors, stddev))
         inside += angles.position[elbow] < 2 * angles.position_stddev[elbow]
         unknown += bool(np.isinf(angles.position_stddev[rotation]))
     assert 0.92 < inside / count < 0.97

@@ -38,13 +38,14 @@ def errors(found: Tracked) -> tuple[FloatArray, FloatArray, list[str]]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_errors_of_the_default_filter_are_within_three_standard_deviations(
-    name: str, replayed_wave: Path, tmp_path: Path
-) -> None:
+def test_errors_of_the_default_filter_are_as_large_as_stated(name: str, replayed_wave: Path, tmp_path: Path) -> None:
+    """DESIGN 4: 95 % bands hold in 88 % of the frames or more; 3 deviations in 97 %, as a person's errors persist."""
     excerpt = name == "excerpt"
     away, stddev, names = errors(read(replayed_wave) if excerpt else tracked(_BAGS / name, DEFAULT_FILTER, tmp_path))
     known = np.isfinite(stddev)
-    assert (np.abs(away)[known] <= 3.0 * stddev[known]).all()
+    size = np.abs(away)[known] / stddev[known]
+    assert (size < 1.96).mean() > 0.88
+    assert (size < 3.0).mean() > 0.97
     trunk = [name.startswith("trunk") for name in names]
     assert sum(trunk) == 3
     assert np.nanmax(np.abs(np.where(known, away, np.nan))[:, trunk]) < 25.0
