@@ -161,7 +161,7 @@ def test_a_magnetic_disturbance_is_named_and_covered(oriented: bool) -> None:
             return sample
         return replace(sample, magnetic_field=sample.magnetic_field + np.array([3e-5, -2e-5, 2e-5]))
 
-    fed = feed(recorded("reaching", imus, SECONDS, seed=3), meddle=iron)
+    fed = feed(recorded("reaching", imus, SECONDS, seed=3), meddle=iron, seconds=18.0)
     assert any(line == "forearm_left: magnetic field disturbed" for line in lines(fed, 9.0, 16.0))
     assert not any("disturbed" in line for line in lines(fed, 0.0, 7.9))
     assert covered(fed, "forearm_left", 8.0).mean() > 0.95

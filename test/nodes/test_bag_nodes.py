@@ -37,6 +37,7 @@ from body_tracking.recording.rosbag2 import (  # noqa: E402
     deserialize,
     serialize,
 )
+from draws import some  # noqa: E402
 
 Stored = tuple[str, bytes, int]
 
@@ -330,7 +331,7 @@ def test_recording_is_started_and_stopped_by_service(bench, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "parameters", [{}, {"model_covariance": True}, {"topics": [MODEL_COVARIANCE, "/talk"]}], ids=str
+    "parameters", some([{}, {"model_covariance": True}, {"topics": [MODEL_COVARIANCE, "/talk"]}], 2), ids=str
 )
 def test_model_covariance_is_recorded_only_by_option(bench, tmp_path, parameters):
     bench.publish(100.0, lambda: "x", MODEL_COVARIANCE, "/talk")

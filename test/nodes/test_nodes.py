@@ -30,6 +30,7 @@ from body_tracking.messages.cdr import decode_skeletons  # noqa: E402
 from body_tracking.messages.skeletons import cloud_to_skeletons, skeletons_to_cloud  # noqa: E402
 from body_tracking.pipeline import graph  # noqa: E402
 from body_tracking.recording.rig import RigReader  # noqa: E402
+from draws import some  # noqa: E402
 
 ROS = RosMessages()
 FRAME_NS = 33_333_333
@@ -357,7 +358,7 @@ def test_backend_whose_status_raises_keeps_publishing(tmp_path: Path) -> None:
         assert "OSError: closed twice" in running.log("kinect_skeleton")
 
 
-@pytest.mark.parametrize(("entry", "said"), [("nowhere:Camera", "nowhere"), ("mycamera:Film", "Film")])
+@pytest.mark.parametrize(("entry", "said"), some([("nowhere:Camera", "nowhere"), ("mycamera:Film", "Film")]))
 def test_backend_that_cannot_be_loaded_is_reported_in_one_line(tmp_path: Path, entry: str, said: str) -> None:
     with Running(tmp_path) as running:
         running.environment |= installed(tmp_path, entry)
