@@ -35,6 +35,7 @@ NEEDED: dict[str, dict[str, object]] = {
     "joint_angles": {"input": "model_state"},
     "robot_commands": {"mapping": ROOT / "config" / "robots" / "iiwa7.yaml"},
     "bag_player": {"bag": BAG},
+    "mesh_tracker": {"depth": "[kinect1]"},
     "bag_recorder": {"start_recording": False},
     "viewer": {"port": 0},
     **{name: {"setup": ROOT / "config" / "marker_setup"} for name in MARKER_NODES},

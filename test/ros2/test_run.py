@@ -17,7 +17,7 @@ MARKER_NODES = (
     "rigid_body_tracker",
     "marker_joint_angles",
 )
-LACKING = ("robot_commands", "bag_player", "kinect_skeleton")
+LACKING = ("robot_commands", "bag_player", "kinect_skeleton", "mesh_tracker")
 """Nodes that do nothing without a parameter."""
 
 
@@ -32,6 +32,7 @@ class AllNodes:
             "imu_skeleton": {"segments": "[forearm_left]"},
             "robot_commands": {"mapping": mapping},
             "bag_player": {"bag": bag, "topics": "[/kinect2/skeleton]", "start_paused": "true"},
+            "mesh_tracker": {"depth": "[kinect1]"},
             "bag_recorder": {"folder": "recording", "start_recording": "false"},
             "viewer": {"port": 0},
             **{name: {"setup": tools.share / "config" / "marker_setup"} for name in MARKER_NODES},
