@@ -32,12 +32,14 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
         return
     imus = options["imus"]
     worn = graph.imu_topics(imus if isinstance(imus, tuple) else ())
-    orientations: dict[str, Value] = {"orientations": tuple(each.segment for each in worn)} if worn else {}
+    defaults: dict[str, Value] = {"orientations": tuple(each.segment for each in worn)} if worn else {}
+    if options["sensors"] and options["sensors"] == options["computed"]:
+        defaults["kinect_arms"] = False  # joints of a fitted mesh, and no Kinect's
     chosen = asked(options, filter="filter", input="filter_input", subject="subject", people="people")
     yield NodeSpec(
         "skeleton_filter",
         "skeleton_filter",
-        defaults=orientations,
+        defaults=defaults,
         parameters={**sensors_and_transport(options), **chosen},
     )
 
