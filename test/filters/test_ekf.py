@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from bent_hands import hand_columns, turned_over
-from body_tracking.core.measurement import BASE_STDDEV
+from body_tracking.core.measurement import BASE_STDDEV, joint_correlation
 from body_tracking.core.skeleton import (
     MIRROR,
     N_JOINTS,
@@ -135,7 +135,8 @@ defect of the filter, which should reach 0.90."""
 
 
 def test_joint_centre_offsets_are_in_the_published_covariance() -> None:
-    """Constant offsets of the deviation that the measurement model states, of people in random poses."""
+    """Constant offsets of the deviation and correlation that the measurement model states, in random poses."""
+    root = np.linalg.cholesky(joint_correlation())
     rng = np.random.default_rng(5)
     stated = np.broadcast_to(np.diag([0.03**2] * 3), (N_JOINTS, 3, 3))
     # of forearms and hands it is true to first order only
@@ -144,7 +145,7 @@ def test_joint_centre_offsets_are_in_the_published_covariance() -> None:
     count = draws(5, 60)
     for seed in range(count):
         truth = random_truth(100 + seed, 1.0, rate=15.0)
-        offsets = BASE_STDDEV[:, None] * rng.normal(size=(N_JOINTS, 3))
+        offsets = BASE_STDDEV[:, None] * (root @ rng.normal(size=(N_JOINTS, 3)))
         frames = [
             replace(frame, positions=frame.positions + offsets, covariances=stated)
             for frame in measured(truth, 0.004, seed).skeletons

@@ -7,6 +7,7 @@ from scipy.linalg import block_diag
 
 from body_tracking.calibration.joint_centres import JointCentres
 from body_tracking.core.body_model import Linearisation
+from body_tracking.core.measurement import joint_correlation
 from body_tracking.core.skeleton import N_JOINTS, FloatArray, Joint
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.sources import PER_SOURCE
@@ -36,6 +37,9 @@ class Displacement:
             space.model.joints, [Joint[f"{name}_{side}"] for name in _BENT for side in ("LEFT", "RIGHT")]
         )
         self._rows = (_DIMENSIONS * space.model.joints[:, None] + np.arange(_DIMENSIONS)).reshape(-1)
+        joints = space.model.joints
+        correlation = joint_correlation()[np.ix_(joints, joints)]
+        self._root = np.kron(np.linalg.cholesky(correlation), np.eye(_DIMENSIONS))
         self.prior_information = block_diag(np.diag(space.rest_information), np.linalg.inv(space.lengths_covariance))
 
     def displaced(self, state: State) -> FloatArray:
@@ -69,7 +73,7 @@ class Displacement:
         if self._centres.offsets is not None:
             known: FloatArray = self._parameters.offset_scale**2 * gain @ self._left(state, lines) @ gain.T
             return known
-        displacement: FloatArray = gain * offsets.repeat(_DIMENSIONS)
+        displacement: FloatArray = gain * offsets.repeat(_DIMENSIONS) @ self._root
         return displacement @ displacement.T
 
     def _left(self, state: State, lines: Linearisation) -> FloatArray:

@@ -499,7 +499,7 @@ class ExtendedKalmanFilter:
             return None
         sensors: dict[str, SensorState] = {}
         for each in self._waiting:
-            known = sensors.get(each.sensor) or self._sensors.unknown(each)
+            known = sensors.get(each.sensor) or self._sensors.unknown(each, len(by_sensor) == len(self._waiting))
             known = self._sensors.seen_by(known, each, each.measured)
             slow = np.maximum(known.slow, self._sensors.least_slow(known.white, each))
             sensors[each.sensor] = known.but(slow=slow)

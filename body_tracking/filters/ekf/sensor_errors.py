@@ -30,6 +30,13 @@ _OUTLYING = 6.0
 NEGLIGIBLE_SLOW = 1e-3
 STRETCH = 0.1
 """Share of the length of an upper arm or forearm that a sensor, at unit scale of its slow errors, is wrong by."""
+_LEAST_STRETCH = 0.067
+"""The same, of a sensor that states covariances, at least, where no orientations are measured: a Kinect v2's upper arms
+and forearms vary by 6.7 % (root mean square over clips of UI-PRMD)."""
+_ALONE = 0.1
+"""Share of the parameter ``slow_scale`` for a sensor that no other one contradicts: with all of it the population's
+segment lengths outweigh the person's in the first seconds, and elbows err by 10 instead of 6 degrees
+(``benchmarks/kinect_vs_vicon.py``)."""
 _SLOW_BOUND = 25.0
 _MEDIAN_OF_CHI2 = 0.455
 _LEAST_ERROR = 0.004
@@ -60,11 +67,18 @@ class SensorErrors:
         self._limb_points = self._limb_table()
         self.slow_size = 3 * space.points + len(self._limbs)
 
-    def unknown(self, measurement: Measurement) -> SensorState:
-        """What is taken of a sensor before it is known; slow errors of one that states how much it errs."""
+    def unknown(self, measurement: Measurement, alone: bool = False) -> SensorState:
+        """What is taken of a sensor before it is known; slow errors of one that states how much it errs.
+
+        Args:
+            measurement: its first one.
+            alone: there is no other sensor.
+        """
         space = self._space
         p = self._parameters
-        slow = p.slow_scale if measurement.skeleton.covariances is not None else 0.0
+        stated = measurement.skeleton.covariances is not None
+        points = _ALONE * p.slow_scale if alone else p.slow_scale
+        slow = np.array([points, (_LEAST_STRETCH / STRETCH) ** 2]) if stated else np.zeros(2)
         white = np.full(space.points, p.white_stddev**2)
         return SensorState(
             (),
@@ -72,10 +86,10 @@ class SensorErrors:
             white,
             np.zeros(space.points),
             np.zeros(space.points),
-            np.array([slow, 0.0]),
-            np.array([slow, 0.0]),
+            slow,
+            slow,
             np.full(2, 4.0),
-            measurement.skeleton.covariances is not None,
+            stated,
         )
 
     def seen_by(self, sensor: SensorState, measurement: Measurement, used: BoolArray) -> SensorState:
@@ -128,7 +142,7 @@ class SensorErrors:
         """
         least = self.least_slow(sensor.white, measurement)
         if oriented and measurement.skeleton.covariances is not None:
-            least[0] = max(least[0], self._parameters.slow_beside_orientations)
+            least = np.array([max(least[0], self._parameters.slow_beside_orientations), 0.0])
         # It changes slowly, and takes a while to compute.
         soon = sensor.stamps and measurement.stamp_ns // _SLOW_PERIOD_NS == sensor.stamps[-1] // _SLOW_PERIOD_NS
         # What is white is not known at first, and would be taken for slow.
@@ -163,7 +177,8 @@ class SensorErrors:
     def least_slow(self, white: FloatArray, measurement: Measurement) -> FloatArray:
         """(2,) lower bounds of the systematic error's scale: total expected error minus the measured white noise."""
         missing = self._space.points * _LEAST_ERROR**2 - float(white.sum())
-        return np.array([max(missing, 0.0) / float(measurement.model_variance.sum()), 0.0])
+        stretch = 0.0 if measurement.skeleton.covariances is None else (_LEAST_STRETCH / STRETCH) ** 2
+        return np.array([max(missing, 0.0) / float(measurement.model_variance.sum()), stretch])
 
     def per_error(self, scales: FloatArray) -> FloatArray:
         """(61,) what belongs to each slow error, from (2,) what belongs to those of points and of limbs."""
