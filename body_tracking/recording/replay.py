@@ -205,6 +205,7 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
             sources = played(settings.options(), bag.topics)
         except graph.GraphError as error:
             raise ReplayError(f"{bag_path}: {error}") from error
+        settings = replace(settings, more={**settings.more, "played": sources})
         kept = tuple(dict.fromkeys((*topics, *truth, *sources)))
         passed = {topic: (bag.topics[topic].type_name, bag.topics[topic].qos) for topic in kept}
         if settings.calibration_file is not None:

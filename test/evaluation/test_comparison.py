@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.measurement import joint_correlation
 from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, Joint
 from body_tracking.evaluation.comparison import (
     ALIGNED,
@@ -51,7 +52,9 @@ def estimate(delay: float = 0.0, noise: float = 0.0, **changed: object) -> Recor
     stamps_ns = truth().stamps_ns[10:-1:2] + 7_000_000
     zero = int(truth().stamps_ns[0])
     positions = Curve(truth().seconds(zero), truth().positions).at((stamps_ns - zero) / NANOSECONDS - delay)
-    positions = positions + noise * np.random.default_rng(4).standard_normal(positions.shape)
+    # errors of the joints of a bone are alike, as the deviations of angles take them to be
+    alike = np.linalg.cholesky(joint_correlation())
+    positions = positions + noise * alike @ np.random.default_rng(4).standard_normal(positions.shape)
     covariances = np.broadcast_to(max(noise, 1e-3) ** 2 * np.eye(3), (*positions.shape, 3))
     made = Recorded(Path("mine"), "/filtered/skeleton", "world", stamps_ns, positions, covariances)
     return replace(made, **changed)  # type: ignore[arg-type]
