@@ -80,7 +80,8 @@ def manifest() -> ElementTree.Element:
 @pytest.fixture(scope="module")
 def node_names() -> set[str]:
     """The node files: one node, one file."""
-    nodes = {path.stem for path in (ROOT / "body_tracking" / "nodes").glob("*.py") if "def main" in path.read_text()}
+    files = (ROOT / "body_tracking" / "nodes").glob("*.py")
+    nodes = {path.stem for path in files if re.search(r"^(def )?main\b", path.read_text(), re.MULTILINE)}
     assert "fusion" in nodes
     return nodes
 

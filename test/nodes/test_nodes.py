@@ -251,7 +251,7 @@ def test_a_t_pose_that_is_held_is_logged(nodes: Running) -> None:
         publisher.publish(skeletons_to_cloud([replace(frame, stamp_ns=begin + frame.stamp_ns - first)], ROS))
         nodes.executor.spin_once(timeout_sec=0.005)
     assert nodes.until(lambda: nodes.diagnostics["skeleton_filter"].get("t_poses") == "1")
-    assert nodes.until(lambda: "learnt from a T-pose" in nodes.log("skeleton_filter"))
+    assert nodes.until(lambda: "estimated from a T-pose" in nodes.log("skeleton_filter"))
     nodes.node.destroy_publisher(publisher)
 
 
