@@ -12,17 +12,21 @@ import numpy as np
 from body_tracking.core.camera import Camera
 from body_tracking.core.parameters import Parameter, Value, fields_of, parameters_from
 from body_tracking.core.qos import LATCHED, RELIABLE
+from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.core.sources import check_sensor_name, optical_frame
+from body_tracking.fusion.placement import Placement
+from body_tracking.fusion.stage import calibration_inputs
 from body_tracking.mesh import body_model, storage
 from body_tracking.mesh.body_model import Body
 from body_tracking.mesh.codecs import DepthImage, DepthInfo, MeshMarker
 from body_tracking.mesh.depth import DepthCamera, DepthError
 from body_tracking.mesh.person import COVERED
 from body_tracking.mesh.personalisation import DistinctPoses, PersonalisationError, personalise
+from body_tracking.mesh.sensor_orientations import SensorOrientations
 from body_tracking.mesh.topics import IMAGES, PERSONALISE_SERVICE, depth_topic, info_topic, mesh_sensor, mesh_topic
 from body_tracking.mesh.tracking import MeshTracker, Tracked, TrackerParameters, prepare
-from body_tracking.messages.codecs import Skeletons
+from body_tracking.messages.codecs import Orientation, SensorClock, Skeletons
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.shared import RELIABLE as TRANSPORT
 from body_tracking.pipeline.shared import names_in, skeleton_qos
@@ -45,6 +49,16 @@ _PERSONALISED_FROM = Parameter(
 _MESH_RATE = Parameter(
     "mesh_rate", 5.0, "publish the mesh at most this often, and only while there is a subscriber", "Hz", 0.1, 100.0
 )
+ORIENTATIONS = Parameter(
+    "orientations",
+    (),
+    "arm segments with inertial sensors, whose orientations come from /imu/<segment>/orientation and are in the fit: "
+    "upper_arm, forearm, hand, each _left or _right. Not for segments whose orientations the filter takes, too",
+)
+_ORIENTATIONS: Final = 32
+"""Queue of orientations per segment: half a second."""
+_CALIBRATIONS: Final = 1000
+"""Queue of poses and clocks, long enough that none is lost while an image is fitted."""
 _KEPT: Final = 64
 """Images of a camera that wait with the parameter ``reliable``: two seconds, 60 MB at 512x424."""
 _NO_INFO: Final = "images without camera_info"
@@ -57,6 +71,7 @@ class MeshStage(Stage):
     PARAMETERS = (
         DEPTH,
         PERSON,
+        ORIENTATIONS,
         *parameters_from(TrackerParameters),
         _PERSONALISED_FROM,
         _MESH_RATE,
@@ -69,6 +84,9 @@ class MeshStage(Stage):
         if not cameras or len(set(cameras)) < len(cameras):
             raise graph.GraphError(f"depth cameras: {', '.join(cameras) or 'none'}; expected one or more, each once")
         self.sensors = {camera: DepthSensor(camera, values, self.events) for camera in cameras}
+        segments = names_in(values["orientations"])
+        self._orientations = SensorOrientations(segments)
+        self._counters: Counter[str] = Counter()
         prepare()
         reliable = bool(values["reliable"])
         inputs, outputs = [], []
@@ -89,16 +107,27 @@ class MeshStage(Stage):
                 Port(sensor.mesh_topic, MeshMarker(), RELIABLE),
             ]
             self._by_topic |= {info: sensor, images: sensor}
+        self._segments = {graph.orientation_topic(each): each for each in segments}
+        if segments:
+            inputs += calibration_inputs(len(cameras), _CALIBRATIONS)
+            qos = skeleton_qos(values)
+            inputs += [Port(topic, Orientation(each), qos, _ORIENTATIONS) for topic, each in self._segments.items()]
         self.inputs, self.outputs = tuple(inputs), tuple(outputs)
         self.services = {PERSONALISE_SERVICE: self._personalise}
 
     def take(self, topic: str, payload: Any, now: Now) -> Iterable[Output]:
+        if topic in self._segments:
+            self._orientations.add(payload)
+            return
+        if topic in (graph.CALIBRATION, graph.CALIBRATION_CLOCK):
+            self._place(payload)
+            return
         sensor = self._by_topic[topic]
         if isinstance(payload, Camera):
             sensor.calibrate(payload)
             return
         stamp_ns, _, depth = payload
-        tracked = sensor.update(stamp_ns, depth)
+        tracked = sensor.update(stamp_ns, depth, self._orientations)
         if tracked is None:
             return
         frame_id = optical_frame(sensor.name)
@@ -107,6 +136,16 @@ class MeshStage(Stage):
             posed = tracked.fit.posed.vertices
             yield Output(sensor.mesh_topic, (stamp_ns, frame_id, posed[sensor.body.model.faces]), stamp_ns)
 
+    def _place(self, payload: SensorPose | SensorClock) -> None:
+        """Take a pose or a clock of the calibration; those of other sensors are not needed."""
+        for sensor in self.sensors.values():
+            if payload.sensor != sensor.name:
+                continue
+            if isinstance(payload, SensorPose):
+                sensor.placement.set_pose(payload)
+            else:
+                sensor.placement.set_clock(payload.valid_from_ns, payload.clock)
+
     def _personalise(self) -> str:
         for sensor in self.sensors.values():
             sensor.personalise_anew()
@@ -114,11 +153,15 @@ class MeshStage(Stage):
 
     def refused(self, topic: str) -> None:
         """Count a message of another encoding, or a calibration that cannot be used."""
-        self._by_topic[topic].counters["messages that cannot be used"] += 1
+        counters = self._by_topic[topic].counters if topic in self._by_topic else self._counters
+        counters["messages that cannot be used"] += 1
 
     def reset(self, topic: str) -> None:
-        """Forget the person, not the shape of the body."""
-        self._by_topic[topic].reset()
+        """Forget the person, not the shape of the body; or the orientations of one segment."""
+        if topic in self._by_topic:
+            self._by_topic[topic].reset()
+        elif topic in self._segments:
+            self._orientations.forget(self._segments[topic])
 
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
         """A camera without calibration, with images of another size, or whose lens is covered is named."""
@@ -135,7 +178,10 @@ class MeshStage(Stage):
 
     @property
     def counters(self) -> Mapping[str, int]:
-        return {f"{name} {key}": each for name, sensor in self.sensors.items() for key, each in sensor.counters.items()}
+        found = {
+            f"{name} {key}": each for name, sensor in self.sensors.items() for key, each in sensor.counters.items()
+        }
+        return {**found, **{f"inertial {key}": each for key, each in self._counters.items()}}
 
 
 class DepthSensor:
@@ -150,6 +196,7 @@ class DepthSensor:
         name: of the sensor whose skeletons are published.
         body: of the person.
         problem: why images are of no use; "" where they are, or where only nobody is there.
+        placement: pose of the camera in ``world``, and its clock, by the calibration.
 
     Raises:
         PersonFileError: the file of the person is invalid.
@@ -159,6 +206,7 @@ class DepthSensor:
         self.name = mesh_sensor(camera)
         self.skeleton_topic, self.mesh_topic = graph.skeleton_topic(self.name), mesh_topic(camera)
         self.problem = ""
+        self.placement = Placement()
         self._camera, self._events = camera, events
         self._parameters = TrackerParameters(**fields_of(TrackerParameters, values))
         self._needed = int(str(values["personalise_from"]))
@@ -196,8 +244,8 @@ class DepthSensor:
         )
         self.problem = ""
 
-    def update(self, stamp_ns: int, depth: Any) -> Tracked | None:
-        """The person in an image.
+    def update(self, stamp_ns: int, depth: Any, worn: SensorOrientations) -> Tracked | None:
+        """The person in an image, with the orientations of the inertial sensors that the person wears.
 
         Raises:
             DepthError: another size than that of the calibration.
@@ -207,8 +255,10 @@ class DepthSensor:
             self.problem = f"no calibration: nothing on {info_topic(self._camera)}"
             return None
         gone = self._counters["people lost"]
+        names = self._model.joint_names
+        orientations = worn.seen_from(self.placement, stamp_ns, names, self._counters)
         try:
-            tracked = self._tracker.update(stamp_ns, depth)
+            tracked = self._tracker.update(stamp_ns, depth, orientations=orientations)
         except DepthError as error:
             self._counters["images of another size"] += 1
             self.problem = str(error)
@@ -258,7 +308,8 @@ class DepthSensor:
         return True
 
     def reset(self) -> None:
-        """Forget the person and the background."""
+        """Forget the person and the background; the newest pose and clock of the camera hold from now on."""
+        self.placement.restart()
         if self._tracker is not None:
             self._tracker.reset()
 

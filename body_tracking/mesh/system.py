@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 
 from body_tracking.core.message_types import POINT_CLOUD
+from body_tracking.core.parameters import Value
 from body_tracking.core.qos import RELIABLE
 from body_tracking.mesh.topics import (
+    ARM_SEGMENTS,
     PERSONALISE_SERVICE,
     depth_topic,
     info_topic,
@@ -14,6 +16,7 @@ from body_tracking.mesh.topics import (
     mesh_topic,
 )
 from body_tracking.pipeline import graph
+from body_tracking.pipeline.roles import role_of
 from body_tracking.pipeline.system import (
     Command,
     NodeSpec,
@@ -37,7 +40,16 @@ def _cameras(options: Options) -> tuple[str, ...]:
 def _specs(options: Options) -> Iterable[NodeSpec]:
     if _cameras(options):
         given = {"depth": _cameras(options), **asked(options, person="person"), **transport(options)}
-        yield NodeSpec("mesh_tracker", "mesh_tracker", parameters=given)
+        yield NodeSpec("mesh_tracker", "mesh_tracker", defaults=_orientations(options), parameters=given)
+
+
+def _orientations(options: Options) -> dict[str, Value]:
+    """The segments whose orientations are in the fit: none that the filter takes itself, as they would count twice."""
+    imus = options["imus"]
+    if not isinstance(imus, tuple) or role_of(options).input == graph.SENSORS_INPUT:
+        return {}
+    segments = tuple(each.segment for each in graph.imu_topics(imus) if each.segment in ARM_SEGMENTS)
+    return {"orientations": segments} if segments else {}
 
 
 def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:

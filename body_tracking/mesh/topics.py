@@ -13,6 +13,13 @@ MESH_SUFFIX: Final = "_mesh"
 
 PERSONALISE_SERVICE: Final = "mesh_tracker/personalise"
 
+ARM_SEGMENTS: Final = {
+    f"{segment}_{side}": f"{side}_{joint}"
+    for segment, joint in (("upper_arm", "shoulder"), ("forearm", "elbow"), ("hand", "wrist"))
+    for side in ("left", "right")
+}
+"""Joint of the mesh that turns each segment whose inertial sensor the fit can use."""
+
 
 def depth_topic(sensor: str) -> str:
     """The depth images of a sensor."""

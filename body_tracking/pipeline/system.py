@@ -21,7 +21,11 @@ Options: TypeAlias = Mapping[str, Value]
 
 
 class Place(IntEnum):
-    """A node's place between the sensors and the angles; no node needs an output of a later one."""
+    """A node's place between the sensors and the angles.
+
+    No node needs an output of a later one; the orientations of inertial sensors, which improve what a node of IMAGES
+    finds, are the one that it may take.
+    """
 
     SOURCE = 0
     IMAGES = 1

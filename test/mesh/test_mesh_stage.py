@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,16 +11,22 @@ import numpy as np
 import pytest
 from depth_recording import recording
 
+from body_tracking.core import so3
 from body_tracking.core.camera import Camera
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.orientation import OrientationError, SegmentOrientation
 from body_tracking.core.parameters import check_all
-from body_tracking.core.skeleton import Joint, SingleArray
+from body_tracking.core.sensor_poses import SensorPose
+from body_tracking.core.skeleton import NANOSECONDS, Joint, SingleArray
 from body_tracking.mesh import body_model, stage, storage
 from body_tracking.mesh.codecs import DepthImage, MeshMarker
 from body_tracking.mesh.depth import DepthError
 from body_tracking.mesh.person import COVERED
+from body_tracking.mesh.sensor_orientations import SensorOrientations
 from body_tracking.mesh.stage import MeshStage
 from body_tracking.mesh.topics import depth_topic, info_topic, mesh_topic
 from body_tracking.messages.base import MessageError
+from body_tracking.messages.codecs import SensorClock
 from body_tracking.messages.images import array_to_image
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.stage import Now, Output
@@ -184,6 +191,90 @@ def test_a_depth_camera_is_a_sensor_of_the_graph_that_its_mesh_tracker_computes(
     assert played(options, {INFO, IMAGES}) == (INFO, IMAGES)
     with pytest.raises(graph.GraphError, match=IMAGES):
         played(options, {INFO, "/kinect1/skeleton"})
+
+
+# --- inertial sensors
+
+
+CAMERA_POSE = SensorPose("kinect1_mesh", np.array([1.0, 2.0, 3.0]), so3.exp(np.array([0.4, -1.2, 2.0])))
+
+
+HANGING = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
+"""Axes forward, left and up of a forearm whose person faces the camera, in the optical frame."""
+FOREARM = HANGING @ so3.quat_to_matrix(so3.exp(np.array([0.0, -np.radians(40.0), 0.0])))
+
+
+def turned(stamp_ns: int, quat_xyzw: np.ndarray, rate: np.ndarray | None = None) -> SegmentOrientation:
+    rotation, variance = so3.quat_to_matrix(quat_xyzw), 1e-4 if rate is not None else 0.0
+    return SegmentOrientation(stamp_ns, "imu", "forearm_left", rotation, 1e-4 * np.eye(3), rate, variance)
+
+
+def test_an_orientation_comes_to_the_fit_in_the_cameras_frame_at_the_images_time() -> None:
+    worn = SensorOrientations(("forearm_left",))
+    placement = calibrated().sensors["kinect1"].placement
+    placement.set_pose(CAMERA_POSE)
+    placement.set_clock(0, ClockModel(offset_ns=-5 * NANOSECONDS))
+    at_ns = 100 * NANOSECONDS
+    rate, true = np.array([3.0, -1.0, 2.0]), so3.exp(np.array([0.3, 0.5, -0.7]))
+    for before_ns in (60_000_000, 20_000_000, -30_000_000):
+        measured = so3.quat_multiply(true, so3.exp(-rate * before_ns / NANOSECONDS))
+        worn.add(turned(at_ns - before_ns, measured, rate))
+    names = body_model.load().joint_names
+    counters: Counter[str] = Counter()
+    (found,) = worn.seen_from(placement, at_ns - 5 * NANOSECONDS, names, counters)
+    assert names[found.joint] == "left_elbow" and not counters
+    expected = CAMERA_POSE.rotation.T @ so3.quat_to_matrix(true)
+    np.testing.assert_allclose(found.rotation, expected, atol=1e-9)
+    # 0.6 deg of the sensor, and what the frames of person and mesh differ by
+    assert (np.radians(0.6) < found.stddev).all() and (found.stddev < np.radians(10.0)).all()
+    # 60 ms after the newest one there is none
+    assert worn.seen_from(placement, at_ns - 5 * NANOSECONDS + 90_000_001, names, counters) == []
+    assert counters == {"images without an orientation of forearm_left": 1}
+
+
+def test_orientations_wait_for_the_pose_of_the_camera_and_then_turn_a_hidden_forearm() -> None:
+    node = calibrated(orientations=("forearm_left",))
+    topic = graph.orientation_topic("forearm_left")
+    assert {topic, graph.CALIBRATION, graph.CALIBRATION_CLOCK} < {port.topic for port in node.inputs}
+    (first,) = take(node, 0)
+    assert node.counters["kinect1 images without the camera's pose for inertial sensors"] == 1
+    [*node.take(graph.CALIBRATION, replace(CAMERA_POSE, sensor="kinect2"), NOW)]
+    [*node.take(graph.CALIBRATION_CLOCK, SensorClock("kinect1_mesh", 0, ClockModel()), NOW)]
+    [*node.take(graph.CALIBRATION, CAMERA_POSE, NOW)]
+    # the arm hangs in the images; the sensor says that the forearm is raised forward by 40 degrees
+    joints = recording().joints[STAMPS[0]]
+    pixel = recording().camera.project(joints[[Joint.ELBOW_LEFT, Joint.WRIST_LEFT, Joint.HAND_TIP_LEFT]]).astype(int)
+    (left, top), (right, bottom) = pixel.min(axis=0) - 8, pixel.max(axis=0) + 8
+    measured = so3.matrix_to_quat(CAMERA_POSE.rotation @ FOREARM)
+    for number in range(1, 10):
+        hidden = recording().images[STAMPS[number]].copy()
+        hidden[top:bottom, left:right] = 1.2
+        [*node.take(topic, turned(STAMPS[number] + 5_000_000, measured), NOW)]
+        (output,) = take(node, number, hidden)
+    along = [
+        each.positions[Joint.WRIST_LEFT] - each.positions[Joint.ELBOW_LEFT]
+        for each in (first.payload[0], output.payload[0])
+    ]
+    off = [np.arccos(each @ -FOREARM[:, 2] / np.linalg.norm(each)) for each in along]
+    assert off[0] > np.radians(25.0) and off[1] < np.radians(8.0)
+    # a jump back of its time forgets the sensor
+    node.reset(topic)
+    take(node, 10)
+    assert node.counters["kinect1 images without an orientation of forearm_left"] == 1
+    node.refused(topic)
+    assert node.counters["inertial messages that cannot be used"] == 1
+
+
+def test_only_segments_that_the_mesh_turns_carry_sensors() -> None:
+    with pytest.raises(OrientationError, match=r"pelvis.*forearm_left"):
+        made(orientations=("forearm_left", "pelvis"))
+
+
+@pytest.mark.parametrize(("filter_name", "to_mesh"), [("", True), ("lkf_zero_velocity", True), ("ekf", False)])
+def test_an_orientation_goes_to_the_mesh_or_to_the_filter_that_uses_it(filter_name: str, to_mesh: bool) -> None:
+    given = {"depth": ("kinect1",), "imus": ("forearm_left:wrist", "pelvis"), "filter": filter_name}
+    specs = {spec.name: spec for spec in nodes_for(options_of(**given))}
+    assert specs["mesh_tracker"].defaults == ({"orientations": ("forearm_left",)} if to_mesh else {})
 
 
 def test_calibrations_are_compared_by_value() -> None:
