@@ -2,10 +2,12 @@
 
 **Exchanged.** A table has the log likelihoods of each of k streams on each of k segments; the assignment with the
 highest sum (Kuhn and Munkres) shows an exchange. The stated segments get a prior in favour, because forearm and upper
-arm of one side turn so similarly that each fits the other. With a skeleton, the correlation rho of the turning rates
-of sensor and bone over n' independent samples has the log likelihood
+arm of one side turn so similarly that each fits the other. With a skeleton, exchanged sensors turn as the other's bone:
+the difference of two sensors' turning rates has the correlation rho with the opposite difference of their bones', over
+n' independent samples. Limbs that move alike (a squat) have no difference, and are not told apart by it. The logarithm
+of the likelihood ratio is
 
-    - n' / 2 log(1 - rho^2),  0 for rho < 0                                                                         (13)
+    - n' / 2 log(1 - rho^2),  with the sign of rho                                                                  (13)
 
 and needs neither alignment nor heading. In a pose, the orientation's distance from the intended mounting is normal with
 the variances of both. Of sensors with individual unknown headings, only the inclination counts.
@@ -18,6 +20,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from itertools import combinations
 from typing import Final
 
 import numpy as np
@@ -61,29 +64,40 @@ def assign(stated: Sequence[str], likelihood: FloatArray) -> tuple[str, ...]:
 
 
 def likelihood_by_motion(sensors: Sequence[Series], bones: Sequence[Series | None]) -> FloatArray:
-    """(k, k) log likelihoods by how fast sensors and bones turn, in one clock (eq. 13).
+    """(k, k) log likelihood ratios by how fast sensors and bones turn, in one clock (eq. 13).
 
     Args:
         sensors: k streams.
-        bones: of the k segments by a camera; None for an unseen one, whose log likelihoods are 0.
+        bones: of the k segments, in the same order, by a camera; None for an unseen one, whose ratios are 0.
+
+    Returns:
+        Of stream i being on segment j, and stream j on i, against both being where they are stated; 0 on the diagonal.
     """
-    result = np.zeros((len(sensors), len(bones)))
-    seen = [(j, bone) for j, bone in enumerate(bones) if bone is not None and len(bone.stamps)]
-    for i, sensor in enumerate(sensors):
-        if not len(sensor.stamps):
-            continue
-        for j, bone in seen:
-            begin, end = max(sensor.stamps[0], bone.stamps[0]), min(sensor.stamps[-1], bone.stamps[-1])
-            if end - begin < LEAST_OVERLAP:
-                continue
-            times = np.arange(begin, end, STEP)
-            (a, known_a), (b, known_b) = sensor.at(times), bone.at(times)
-            a, b, both = a[:, 0], b[:, 0], known_a & known_b
-            if both.sum() * STEP < LEAST_OVERLAP or min(float(a[both].std()), float(b[both].std())) < LEAST_RATE:
-                continue
-            rho = float(np.clip(np.corrcoef(a[both], b[both])[0, 1], 0.0, 0.99))
-            result[i, j] = -0.5 * independent_samples(a, b, both) * np.log1p(-(rho**2))
+    count = len(sensors)
+    result = np.zeros((count, count))
+    for i, j in combinations(range(count), 2):
+        result[i, j] = result[j, i] = _exchanged(sensors[i], sensors[j], bones[i], bones[j])
     return result
+
+
+def _exchanged(one: Series, other: Series, bone: Series | None, other_bone: Series | None) -> float:
+    """Log likelihood ratio of two sensors being exchanged; 0 where too little is seen."""
+    if bone is None or other_bone is None:
+        return 0.0
+    series = (one, other, bone, other_bone)
+    if any(not len(each.stamps) for each in series):
+        return 0.0
+    begin, end = max(each.stamps[0] for each in series), min(each.stamps[-1] for each in series)
+    if end - begin < LEAST_OVERLAP:
+        return 0.0
+    times = np.arange(begin, end, STEP)
+    rates, known = zip(*(each.at(times) for each in series), strict=True)
+    all_known = np.logical_and.reduce(known)
+    worn, seen = rates[0][:, 0] - rates[1][:, 0], rates[3][:, 0] - rates[2][:, 0]
+    if all_known.sum() * STEP < LEAST_OVERLAP or min(worn[all_known].std(), seen[all_known].std()) < LEAST_RATE:
+        return 0.0
+    rho = float(np.clip(np.corrcoef(worn[all_known], seen[all_known])[0, 1], -0.99, 0.99))
+    return float(np.copysign(-0.5 * independent_samples(worn, seen, all_known) * np.log1p(-(rho**2)), rho))
 
 
 def likelihood_by_pose(
@@ -116,8 +130,14 @@ def likelihood_by_pose(
         expected = yaw(psi).T @ pose @ mountings.swapaxes(-1, -2)
         off = so3.rotation_vectors(measured[:, None].swapaxes(-1, -2) @ expected)
         tables.append(-0.5 * (off**2).sum(axis=-1) / variance - 1.5 * np.log(variance))
-    best = max(tables, key=lambda table: float(table[linear_sum_assignment(table, maximize=True)].sum()))
+    # the stated assignment where another fits as well at another heading, as of two forearms in a T-pose half a turn on
+    best = max(tables, key=lambda table: _value(table + SURE * np.eye(len(segments))))
     return np.asarray(best)
+
+
+def _value(table: FloatArray) -> float:
+    """The sum over the best assignment."""
+    return float(table[linear_sum_assignment(table, maximize=True)].sum())
 
 
 class SlipDetector:

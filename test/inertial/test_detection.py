@@ -74,6 +74,28 @@ def test_a_pose_of_sensors_with_magnetometers_tells_left_from_right(seed: int, o
 
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 2**31))
+def test_a_t_pose_of_both_forearms_alone_exchanges_nothing(seed: int) -> None:
+    """The same pose half a turn on has left and right exchanged: nothing says which way the person faces."""
+    arms = [WORN.index("forearm_left"), WORN.index("forearm_right")]
+    names = tuple(WORN[number] for number in arms)
+    measured = held(np.random.default_rng(seed), [0, 1, 2, 3, 4])[arms]
+    pose = pose_rotations(MODEL, "t")[NUMBERS][arms]
+    assert assign(names, likelihood_by_pose(names, measured, pose, MEANT[arms], common_heading=True)) == names
+
+
+def test_limbs_that_move_alike_are_not_exchanged() -> None:
+    """Each sensor fits the other's bone as well as its own; what is left are errors of the camera."""
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        (one, *_), _ = turnings(seed, 0.0)
+        alike = [
+            turning(one.stamps, np.abs(one.values[:, 0] + 0.1 * rng.normal(size=len(one.stamps)))) for _ in range(4)
+        ]
+        assert assign(WORN[:2], likelihood_by_motion(alike[:2], alike[2:])) == WORN[:2]
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 2**31))
 def test_a_pose_of_sensors_with_headings_of_their_own_tells_the_trunk_from_an_arm(seed: int) -> None:
     rng = np.random.default_rng(seed)
     order = [1, 0, 2, 3, 4]
