@@ -31,6 +31,7 @@ from body_tracking.core.camera import Camera
 from body_tracking.core.clocks import ClockModel
 from body_tracking.core.orientation import SegmentOrientation
 from body_tracking.core.parameters import check_all
+from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, SingleArray, Skeleton
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.stage import FilterStage
@@ -58,7 +59,7 @@ HIDDEN, EVERY, FIRST = 0.5, 1.2, 1.0
 """Seconds: for which a forearm is hidden, from one to the next, and the first one."""
 VARIANTS = ("mesh", "mesh+sensor", "kinect", "ekf", "ekf+sensor", "ekf, mesh+sensor", "ekf+sensor, mesh+sensor")
 """Where the inertial sensors go."""
-_BOARD = 0.75
+_BOARD = 0.5
 """Distance of the board from the camera as a share of the arm's."""
 _FLOOR = 10
 _STARTED = 0.02
@@ -233,7 +234,8 @@ def run_hidden(job: Job) -> HiddenRun:
             tracks[behind if name == "mesh" else f"{behind}, mesh+sensor"] = {
                 stamp: (
                     (each.positions - pose.translation) @ pose.rotation,
-                    pose.rotation.T @ each.covariances @ pose.rotation,
+                    # infinite for the legs, which the filter does not model
+                    pose.rotation.T @ np.where(np.isfinite(each.covariances), each.covariances, np.nan) @ pose.rotation,
                 )
                 for stamp, each in filtered
             }
@@ -263,13 +265,14 @@ def _arm(side: int) -> list[int]:
 
 def _fed(
     stage: Stage,
-    pose: Any,
+    pose: SensorPose,
     messages: Iterable[tuple[int, str, Any]],
     orientations: Sequence[SegmentOrientation],
     out: str,
 ) -> Iterator[tuple[int, Skeleton]]:
     """The skeletons on a topic, by stamp: messages and orientations in the order of their stamps."""
-    list(stage.take(graph.CALIBRATION, pose, Now(0, 0))) if orientations or isinstance(stage, FilterStage) else None
+    if any(port.topic == graph.CALIBRATION for port in stage.inputs):
+        list(stage.take(graph.CALIBRATION, pose, Now(0, 0)))
     turned = [(each.stamp_ns, graph.orientation_topic(each.segment), each) for each in orientations]
     for stamp, topic, payload in sorted([*turned, *messages], key=lambda each: each[0]):
         for output in (*stage.take(topic, payload, Now(stamp, stamp)), *stage.poll(stamp)):

@@ -32,7 +32,9 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
         return
     imus = options["imus"]
     worn = graph.imu_topics(imus if isinstance(imus, tuple) else ())
-    defaults: dict[str, Value] = {"orientations": tuple(each.segment for each in worn)} if worn else {}
+    # those of the arms are in the mesh of a depth camera already, and would count twice
+    segments = tuple(each.segment for each in worn if not (options["depth"] and each.segment in graph.ARM_SEGMENTS))
+    defaults: dict[str, Value] = {"orientations": segments} if segments else {}
     if options["sensors"] and options["sensors"] == options["computed"]:
         defaults["kinect_arms"] = False  # joints of a fitted mesh, and no Kinect's
     chosen = asked(options, filter="filter", input="filter_input", subject="subject", people="people")

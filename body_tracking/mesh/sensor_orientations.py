@@ -13,7 +13,7 @@ from body_tracking.core.orientation import OrientationError, SegmentOrientation
 from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.fusion.placement import Placement
 from body_tracking.mesh.solver import Orientation
-from body_tracking.mesh.topics import ARM_SEGMENTS
+from body_tracking.mesh.topics import JOINTS_OF
 
 NEAREST_NS: Final = NANOSECONDS // 20
 """Greatest difference between the stamps of an image and of an orientation that is used with it."""
@@ -35,9 +35,9 @@ class SensorOrientations:
     """
 
     def __init__(self, segments: Sequence[str]) -> None:
-        unknown = [segment for segment in segments if segment not in ARM_SEGMENTS]
+        unknown = [segment for segment in segments if segment not in JOINTS_OF]
         if unknown:
-            known = ", ".join(ARM_SEGMENTS)
+            known = ", ".join(JOINTS_OF)
             raise OrientationError(f"parameter 'orientations': {', '.join(unknown)}: expected some of {known}")
         self._latest: dict[str, deque[SegmentOrientation]] = {each: deque(maxlen=_KEPT) for each in segments}
 
@@ -86,7 +86,7 @@ class SensorOrientations:
                 rotation = rotation @ so3.quat_to_matrix(so3.exp(elapsed * nearest.angular_velocity))
             found.append(
                 Orientation(
-                    names.index(ARM_SEGMENTS[segment]), pose.rotation.T @ rotation, np.sqrt(variances + _FRAMES**2)
+                    names.index(JOINTS_OF[segment]), pose.rotation.T @ rotation, np.sqrt(variances + _FRAMES**2)
                 )
             )
         return found

@@ -8,7 +8,6 @@ from body_tracking.core.message_types import POINT_CLOUD
 from body_tracking.core.parameters import Value
 from body_tracking.core.qos import RELIABLE
 from body_tracking.mesh.topics import (
-    ARM_SEGMENTS,
     PERSONALISE_SERVICE,
     depth_topic,
     info_topic,
@@ -16,7 +15,6 @@ from body_tracking.mesh.topics import (
     mesh_topic,
 )
 from body_tracking.pipeline import graph
-from body_tracking.pipeline.roles import role_of
 from body_tracking.pipeline.system import (
     Command,
     NodeSpec,
@@ -44,11 +42,10 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
 
 
 def _orientations(options: Options) -> dict[str, Value]:
-    """The segments whose orientations are in the fit: none that the filter takes itself, as they would count twice."""
+    """The segments whose orientations are in the fit."""
     imus = options["imus"]
-    if not isinstance(imus, tuple) or role_of(options).input == graph.SENSORS_INPUT:
-        return {}
-    segments = tuple(each.segment for each in graph.imu_topics(imus) if each.segment in ARM_SEGMENTS)
+    worn = graph.imu_topics(imus if isinstance(imus, tuple) else ())
+    segments = tuple(each.segment for each in worn if each.segment in graph.ARM_SEGMENTS)
     return {"orientations": segments} if segments else {}
 
 

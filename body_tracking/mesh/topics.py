@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from body_tracking.core.qos import Qos
+from body_tracking.pipeline.graph import ARM_SEGMENTS
 
 IMAGES: Final = Qos(reliability="reliable", depth=10)
 """Of images: best effort loses one in fourteen."""
@@ -13,10 +14,9 @@ MESH_SUFFIX: Final = "_mesh"
 
 PERSONALISE_SERVICE: Final = "mesh_tracker/personalise"
 
-ARM_SEGMENTS: Final = {
-    f"{segment}_{side}": f"{side}_{joint}"
-    for segment, joint in (("upper_arm", "shoulder"), ("forearm", "elbow"), ("hand", "wrist"))
-    for side in ("left", "right")
+_TURNED_BY: Final = {"upper_arm": "shoulder", "forearm": "elbow", "hand": "wrist"}
+JOINTS_OF: Final = {
+    each: f"{side}_{_TURNED_BY[segment]}" for each in ARM_SEGMENTS for segment, _, side in [each.rpartition("_")]
 }
 """Joint of the mesh that turns each segment whose inertial sensor the fit can use."""
 

@@ -55,6 +55,8 @@ DEFAULT_SENSORS = ("kinect1", "kinect2")
 NO_SENSORS = "none"
 """The value of the option ``sensors`` of a graph without cameras that see skeletons."""
 DEFAULT_BODY = "body1"
+ARM_SEGMENTS = tuple(f"{each}_{side}" for each in ("upper_arm", "forearm", "hand") for side in ("left", "right"))
+"""Segments whose inertial sensors the mesh of a depth camera uses; the filter behind it does not use them again."""
 EXAMPLE_IMUS = ("forearm_left", "forearm_right")
 """Segments with wrist-worn inertial sensors."""
 

@@ -270,11 +270,13 @@ def test_only_segments_that_the_mesh_turns_carry_sensors() -> None:
         made(orientations=("forearm_left", "pelvis"))
 
 
-@pytest.mark.parametrize(("filter_name", "to_mesh"), [("", True), ("lkf_zero_velocity", True), ("ekf", False)])
-def test_an_orientation_goes_to_the_mesh_or_to_the_filter_that_uses_it(filter_name: str, to_mesh: bool) -> None:
-    given = {"depth": ("kinect1",), "imus": ("forearm_left:wrist", "pelvis"), "filter": filter_name}
-    specs = {spec.name: spec for spec in nodes_for(options_of(**given))}
-    assert specs["mesh_tracker"].defaults == ({"orientations": ("forearm_left",)} if to_mesh else {})
+def test_an_orientation_counts_once_in_the_mesh_or_in_the_filter() -> None:
+    given: dict[str, Any] = {"imus": ("forearm_left:wrist", "pelvis"), "filter": "ekf"}
+    specs = {spec.name: spec for spec in nodes_for(options_of(depth=("kinect1",), **given))}
+    assert specs["mesh_tracker"].defaults["orientations"] == ("forearm_left",)
+    assert specs["skeleton_filter"].defaults["orientations"] == ("pelvis",)
+    (alone,) = [spec for spec in nodes_for(options_of(**given)) if spec.name == "skeleton_filter"]
+    assert alone.defaults["orientations"] == ("forearm_left", "pelvis")
 
 
 def test_calibrations_are_compared_by_value() -> None:
