@@ -63,6 +63,7 @@ BENCHMARKS = {
     "kinect_vs_vicon": Benchmark(1, recordings("kinect_vs_vicon")),
     "depth_images": Benchmark(1, MAKEHUMAN),
     "mesh_fit": Benchmark(10, MAKEHUMAN),
+    "mesh_real": Benchmark(1, recordings("depth_turn")),
     "imu_pendulum": Benchmark(1, IMU),
     "imu_recordings": Benchmark(1, IMU),
     "people": Benchmark(10, PAIRS),

@@ -29,6 +29,8 @@ _REACH: Final = 0.25
 """Metres about the predicted mesh in which the person is looked for: 7.5 m/s at 30 Hz."""
 _PERSON_AREA: Final = (0.12, 1.6)
 """Square metres that the camera sees of a person: of a child from the side, and of a large man with his arms out."""
+_TRACKED_AREA: Final = 0.05
+"""The same of a person who is tracked: 0.08 from the side, from the head to the elbows."""
 _PERSON_EXTENT: Final = (0.45, 2.3)
 """Metres of the longest side of the box about a person."""
 _ATTACHED: Final = 0.3
@@ -38,6 +40,8 @@ _LEAST_AREA: Final = 0.0015
 """Square metres of a surface that is more than noise: a part of a hand."""
 _FRAGMENT: Final = 0.15
 """Metres from the box about a person within which smaller surfaces are the person's own, as a hand before the chest."""
+_HEAD: Final = 0.3
+"""The same upwards in the image: the chin may cut the head off from the trunk."""
 _COVERED: Final = 0.02
 """Share of pixels with a distance below which a lens is covered."""
 NO_BODY: Final = 255
@@ -126,7 +130,7 @@ class PersonFinder:
         if predicted is None:
             chosen, alike, people = _person_among(areas, boxes, chosen, choice)
         else:
-            people, alike = int(areas[chosen].sum() > _PERSON_AREA[0]), free
+            people, alike = int(areas[chosen].sum() > _TRACKED_AREA), free
             chosen &= bool(people)
         mask = _of_surfaces(labels, chosen)
         frames = np.where(areas < _PERSON_AREA[0], _SMALL, 1)
@@ -154,7 +158,7 @@ def _person_among(
     if not len(numbers):
         return np.zeros_like(chosen), alike, 0
     nearest = numbers[np.argsort(boxes[numbers].mean(axis=1)[:, 2])][choice % len(numbers)]
-    low, high = boxes[nearest, 0] - _FRAGMENT, boxes[nearest, 1] + _FRAGMENT
+    low, high = boxes[nearest, 0] - [_FRAGMENT, _HEAD, _FRAGMENT], boxes[nearest, 1] + _FRAGMENT
     own = chosen & ~alike & (boxes[:, 0] > low).all(axis=1) & (boxes[:, 1] < high).all(axis=1)
     own[nearest] = True
     return own, alike | own, len(numbers)

@@ -16,7 +16,7 @@ import numpy as np
 from body_tracking.core import so3
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
 from body_tracking.mesh import energy
-from body_tracking.mesh.anatomy import Anatomy
+from body_tracking.mesh.anatomy import SIDES, Anatomy
 from body_tracking.mesh.body_model import Body, Pose, PosedBody
 from body_tracking.mesh.energy import Matches, Observation
 from body_tracking.mesh.skinning import lever_arms, vertex_normals
@@ -156,7 +156,9 @@ class MeshFitter:
         self.ancestors: BoolArray = np.eye(joints, dtype=np.bool_)
         for joint in range(1, joints):
             self.ancestors[joint] |= self.ancestors[model.parents[joint]]
-        self._diagonal = np.arange(3 + 3 * joints)
+        self._arms = [
+            model.index(f"{side}_{joint}") for side in SIDES for joint in ("collar", "shoulder", "elbow", "wrist")
+        ]
 
     def neutral(self, place: FloatArray, elevation: float = 0.0, flexion: float = 0.0) -> Pose:
         """A person who stands upright and looks into the camera.
@@ -174,6 +176,12 @@ class MeshFitter:
         rotations = anatomy.rotations(turned)
         rotations[0] = FACING_CAMERA
         return Pose(rotations, place - self.body.joints[0])
+
+    def with_hanging_arms(self, pose: Pose) -> Pose:
+        """A pose with the arms as in ordinary standing."""
+        rotations = pose.rotations.copy()
+        rotations[self._arms] = self.neutral(np.zeros(3), 0.1, 0.3).rotations[self._arms]
+        return Pose(rotations, pose.translation)
 
     def search(self, observation: Observation, orientations: Sequence[Orientation] = ()) -> Fit:
         """The best fit from several starts of a person who stands somewhere in view.

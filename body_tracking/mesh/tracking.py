@@ -27,7 +27,7 @@ from body_tracking.mesh.energy import Observation, observe
 from body_tracking.mesh.person import NOBODY, PersonFinder, of_body_index
 from body_tracking.mesh.personalisation import personalise
 from body_tracking.mesh.raster import render
-from body_tracking.mesh.solver import WIDE, Fit, JointPoints, MeshFitter, Orientation, Prediction
+from body_tracking.mesh.solver import SCALES, WIDE, Fit, JointPoints, MeshFitter, Orientation, Prediction
 from body_tracking.mesh.uncertainty import kinect_landmarks, placed
 
 _RATES: Final = {"shoulder": 9.0, "elbow": 9.0, "wrist": 9.0, "collar": 3.0}
@@ -41,6 +41,8 @@ _LONGEST_S: Final = 0.2
 """Seconds between two images whose change of pose is a rate."""
 _SKELETON: Final = 0.08
 """Metres: standard deviation of the joints of another sensor's skeleton as a start."""
+_WHOLE: Final = 0.99
+"""Share of points that belong to the body below which an arm may be elsewhere than fitted."""
 _SEEN: Final = 0.05
 """Metres: standard deviation per axis up to which a joint counts as tracked; others are inferred."""
 
@@ -121,6 +123,7 @@ class MeshTracker:
         self._fits: list[tuple[int, Fit]] = []
         self._lost_ns: int | None = None
         self._searched_ns: int | None = None
+        self._arms_ns: int | None = None
         self._choice = 0
         self._body_number: int | None = None
         self.problem = NOBODY
@@ -200,7 +203,7 @@ class MeshTracker:
             prediction = self._predicted(stamp_ns)
             fit = self._fitter.fit(seen, prediction.pose, prediction, orientations)
             if not fit.lost:
-                return fit
+                return self._with_arms(stamp_ns, seen, orientations, fit)
             self.counters["second starts"] += 1
             again = self._fitter.fit(seen, self._fits[-1][1].pose, None, orientations, points, WIDE)
             return min(fit, again, key=lambda each: (each.lost, each.energy))
@@ -214,6 +217,18 @@ class MeshTracker:
         if points is not None and fit.lost:
             fit = self._fitter.fit(seen, fit.pose, None, orientations, points, WIDE)
         return fit
+
+    def _with_arms(self, stamp_ns: int, seen: Observation, orientations: Sequence[Orientation], fit: Fit) -> Fit:
+        """A fit, or a better one from hanging arms: the trunk's surface holds an arm that it hid for some images."""
+        waiting = self.parameters.search_every * NANOSECONDS
+        waits = self._arms_ns is not None and 0 <= stamp_ns - self._arms_ns < waiting
+        if fit.matched >= _WHOLE or waits:
+            return fit
+        self._arms_ns = stamp_ns
+        self.counters["starts with hanging arms"] += 1
+        again = self._fitter.fit(seen, self._fitter.with_hanging_arms(fit.pose), None, orientations)
+        here = self._fitter.evaluate(seen, fit.pose, SCALES[-1], None, orientations).fit
+        return again if not again.lost and again.energy < here.energy else fit
 
     def _predicted(self, stamp_ns: int) -> Prediction:
         """The last pose, moved on by its last change where that is known."""

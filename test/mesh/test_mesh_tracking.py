@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 from depth_recording import recording
 
+from body_tracking.core.camera import Camera
 from body_tracking.core.compiled import LOOPS
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, TrackingState
 from body_tracking.mesh import body_model
-from body_tracking.mesh.depth import DepthCamera, DepthError
+from body_tracking.mesh.depth import DepthCamera, DepthError, to_metres
 from body_tracking.mesh.person import COVERED, NOBODY, PersonFinder
 from body_tracking.mesh.tracking import MeshTracker, Tracked, prepare
 
@@ -108,3 +112,22 @@ def test_an_image_of_another_size_is_refused_and_does_no_harm(tracker: MeshTrack
     with pytest.raises(DepthError, match="100 x 50"):
         tracker.update(STAMPS[2], np.ones((50, 100), np.float32))
     assert all(tracked(tracker, range(3, 5))) and tracker.counters["searches"] == 1
+
+
+def test_a_real_person_who_turns_before_the_camera_is_never_lost(shared_data: Path) -> None:
+    folder = shared_data / "depth_turn"
+    if not folder.is_dir():
+        pytest.skip(f"the real depth images are absent ({folder})")
+    matrix = np.array([[525.0, 0.0, 320.0], [0.0, 525.0, 240.0], [0.0, 0.0, 1.0]])
+    body = body_model.load().body()
+    tracker = MeshTracker(DepthCamera(Camera("camera", 640, 480, matrix, np.zeros(5))), body, np.eye(len(body.shape)))
+    thorax, ahead = body.model.index("spine3"), []
+    for number, file in enumerate(sorted(folder.glob("*_depth.png"))):
+        # every third image of 30 a second; the wall behind is farther, and nobody gives a mask
+        depth = to_metres(cv2.imread(str(file), cv2.IMREAD_UNCHANGED))
+        found = tracker.update(number * NANOSECONDS // 10, depth)
+        assert found is not None, (number, tracker.problem)
+        ahead.append(found.fit.frames[thorax][[0, 2], 0])
+    # once around, in one direction: 355 degrees by the poses of the cameras
+    turned = np.degrees(np.unwrap(np.arctan2(*np.transpose(ahead))))
+    assert abs(turned[-1] - turned[0]) == pytest.approx(355.0, abs=15.0)
