@@ -234,7 +234,10 @@ def test_where_all_sensors_fall_silent_the_extended_filter_predicts(tmp_path: Pa
     assert 26 <= len(predicted) <= 29
     assert report.counters["filter predicted frames"] == len(predicted)
     spread = [np.trace(each.covariances, axis1=1, axis2=2)[Joint.HAND_LEFT] for each in predicted]
-    assert (np.diff(spread) > 0.0).all()
+    # Half a second long the deviation grows; then the posture prior, linearised at an ever vaguer pose, moves it about.
+    soon, later = spread[:15], spread[15:]
+    assert (np.diff(soon) > 0.0).all()
+    assert min(later) > soon[-1]
 
 
 def elbows(bag_path: Path) -> tuple[FloatArray, FloatArray]:
