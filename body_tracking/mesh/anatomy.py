@@ -155,8 +155,6 @@ class Anatomy:
         degrees[self._shoulders] = np.stack([-reach, reach], axis=-1)
         stddev[self._shoulders] = reach / 3.0
         self._to_centre = np.array([_TO_CENTRE[side] for side in SIDES])
-        # clinical zero, not the centre of the reach: an arm that the trunk hides hangs
-        mean[self._shoulders] = np.degrees(so3.log(so3.matrix_to_quat(self._to_centre)))
         degrees[0] = -np.inf, np.inf
         stddev[0] = np.inf
         self.low: FloatArray = np.radians(degrees[..., 0])

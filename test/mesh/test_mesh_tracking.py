@@ -69,6 +69,14 @@ def test_arms_of_an_unknown_person_are_nearer_to_the_truth_than_a_kinects_and_wi
     assert np.mean(skeleton.states == TrackingState.TRACKED) > 0.7
 
 
+def test_an_arm_that_comes_to_point_at_the_camera_is_followed(tracker: MeshTracker) -> None:
+    """With hanging arms as the mean of ordinary postures the right arm stayed down, 0.9 m off; all points fitted."""
+    found = tracked(tracker, range(180, 220))
+    assert all(found)
+    wrists = np.array([np.linalg.norm(off(each), axis=1)[[2, 5]] for each in found if each])
+    assert wrists.max() < 0.25
+
+
 def test_a_covered_lens_is_told_and_the_person_is_found_again_at_once(tracker: MeshTracker) -> None:
     tracked(tracker, range(3))
     # within predict_for the pose is still expected
