@@ -93,7 +93,7 @@ def apart(rng: np.random.Generator) -> MarkerScene:
         turns.append(Rotation.from_rotvec(about).as_matrix() @ base)
     posture = Posture(np.tile(rest[0], (FRAMES, 1, 1)), np.tile(places[0], (FRAMES, 1)), tuple(turns))
     rotations, translations = place(tree_of(joints), posture)
-    return MarkerScene(rig, bodies, times, rotations, translations, turns[0], swing[:, :2], chain_of(joints))
+    return MarkerScene(rig, bodies, times, rotations, translations, swing[:, :2], chain_of(joints))
 
 
 def widest(project: Any, points: FloatArray, where: FloatArray, rng: np.random.Generator) -> FloatArray:

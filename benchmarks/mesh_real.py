@@ -172,8 +172,8 @@ def turning(folder: Path, pictures: Path | None) -> dict[str, Any]:
         each = [figures_of(shown[n], views[n].mask, model.faces) for n in rest if n in shown]
         medians = {figure: float(np.median([one[figure] for one in each])) for figure in each[0]}
         rows[name] = {**medians, **torso(views, shown, rest, thorax), "lost": len(rest) - len(each)}
-    for number, shown in runs["own shape"].items():
-        draw(pictures, f"turn_{number:02}", views[number].depth, shown.fit, model.faces, view.camera)
+    for number, one in runs["own shape"].items():
+        draw(pictures, f"turn_{number:02}", views[number].depth, one.fit, model.faces, view.camera)
     widths = [1e3 * float(np.linalg.norm(np.diff(each.body.joints[shoulders], axis=0))) for each in people]
     return {"views": rows, "shoulder widths, mm": widths}
 
