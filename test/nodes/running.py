@@ -215,7 +215,7 @@ class Running:
         """What a node printed so far."""
         return (self.folder / f"{executable}.log").read_text()
 
-    def until(self, condition: Callable[[], object], timeout: float = 20.0) -> bool:
+    def until(self, condition: Callable[[], object], timeout: float = 60.0) -> bool:
         """Spin until something is so; whether it became so in time."""
         return spin_until(self.executor, condition, timeout)
 

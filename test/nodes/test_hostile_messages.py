@@ -117,7 +117,7 @@ def test_fusion_recovers_after_a_wrong_clock_is_corrected(tmp_path: Path) -> Non
         stamps = [to_nanoseconds(each.header.stamp) for each in fused]
         assert max(stamps) > START_NS + 1800 * NANOSECONDS  # it was taken for true while there was nothing else
         assert stamps[-25:] == [START_NS + number * FRAME_NS for number in range(80, 105)]
-        assert int(running.diagnostics["fusion"].get("other_clock", 0)) > 0
+        assert running.number("fusion", "other_clock") > 0
 
 
 def test_invalid_simulated_time_is_ignored(tmp_path: Path) -> None:
@@ -385,7 +385,7 @@ def test_malformed_clouds_at_500_a_second_leave_memory_flat(tmp_path: Path) -> N
         for name in ("fusion", "body_markers"):  # one reads bytes, the other messages
             running.start(name, reliable=True) if name == "fusion" else running.start(name)
         clouds = running.node.create_publisher(PointCloud2, graph.skeleton_topic("kinect1"), RELIABLE)
-        assert running.until(lambda: clouds.get_subscription_count() == 2)
+        assert running.until(lambda: clouds.get_subscription_count() == 2 and running.said("fusion"), 60.0)
         sizes = []
         for part in (range(count // 3), range(count // 3, count)):
             begin = time.monotonic()
@@ -395,7 +395,7 @@ def test_malformed_clouds_at_500_a_second_leave_memory_flat(tmp_path: Path) -> N
                 running.executor.spin_once(timeout_sec=max(0.0, end - time.monotonic()))
                 time.sleep(max(0.0, end - time.monotonic()))
             # of nodes that have taken all of them: a busy machine leaves messages in queues
-            assert running.until(lambda: int(running.diagnostics["fusion"].get("malformed", 0)) == part.stop)  # noqa: B023
+            assert running.until(lambda: running.number("fusion", "malformed") == part.stop, 60.0)  # noqa: B023
             sizes.append(resident(running))
         before, after = sizes
         assert all(after[name] - before[name] < 1 << 20 for name in after), (before, after)

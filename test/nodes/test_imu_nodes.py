@@ -187,8 +187,8 @@ def test_offline_gives_the_angles_that_the_graph_gave(wrists: Wrists, offline: A
 
 
 def test_silent_sensor_is_reported(wrists: Wrists) -> None:
-    assert wrists.until(lambda: "forearm_right: silent" in wrists.diagnostics["imu_skeleton"][""], 30.0)
-    assert "forearm_left: silent" not in wrists.diagnostics["imu_skeleton"][""]
+    assert wrists.until(lambda: "forearm_right: silent" in wrists.said("imu_skeleton").get("", ""), 30.0)
+    assert "forearm_left: silent" not in wrists.said("imu_skeleton").get("", "")
 
 
 def bad_ones() -> list[Imu]:
@@ -241,10 +241,10 @@ def test_bad_messages_are_counted(wrists: Wrists) -> None:
         publisher.publish(message)
     wanted = before + len(messages)
     assert wrists.until(lambda: wrists.number("imu_skeleton", "refused of forearm_left") == wanted, 30.0), (
-        wrists.diagnostics["imu_skeleton"]
+        wrists.diagnostics
     )
     assert wrists.processes["imu_skeleton"].poll() is None
-    assert topic in wrists.diagnostics["imu_skeleton"]["last malformed"]
+    assert topic in wrists.said("imu_skeleton").get("last malformed", "")
     assert topic in wrists.log("imu_skeleton")
     # an orientation that is none does not stop the filter either
     others = wrists.node.create_publisher(Imu, graph.orientation_topic("forearm_left"), RELIABLE)

@@ -145,20 +145,20 @@ def test_integer_is_accepted_for_a_float(running: Graph) -> None:
 
 
 def test_the_fusion_drops_a_sensor_sooner_and_keeps_its_poses(running: Graph) -> None:
-    assert running.until(lambda: running.diagnostics["calibration"][""] == "calibrated", 60.0)
+    assert running.until(lambda: running.said("calibration").get("", "") == "calibrated", 60.0)
     before = running.number("fusion", "silent")
     assert running.set("fusion", silence=0.02) == [(True, "")]
     # of two sensors at 30 Hz the other's newest frame is often older than that; one without a pose is not counted
-    assert running.until(lambda: running.number("fusion", "silent") > before + 30), running.diagnostics["fusion"]
+    assert running.until(lambda: running.number("fusion", "silent") > before + 30), running.diagnostics
     assert running.set("fusion", silence=0.1) == [(True, "")]
 
 
 def test_the_calibration_warns_by_another_limit(running: Graph) -> None:
-    assert running.until(lambda: running.diagnostics["calibration"][""] == "calibrated", 60.0)
+    assert running.until(lambda: running.said("calibration").get("", "") == "calibrated", 60.0)
     assert running.set("calibration", max_rotation_stddev=0.001) == [(True, "")]
-    assert running.until(lambda: "roughly calibrated" in running.diagnostics["calibration"][""])
+    assert running.until(lambda: "roughly calibrated" in running.said("calibration").get("", ""))
     assert running.set("calibration", max_rotation_stddev=0.05) == [(True, "")]
-    assert running.until(lambda: running.diagnostics["calibration"][""] == "calibrated")
+    assert running.until(lambda: running.said("calibration").get("", "") == "calibrated")
 
 
 def test_the_angles_follow_the_filter(running: Graph) -> None:
@@ -168,7 +168,7 @@ def test_the_angles_follow_the_filter(running: Graph) -> None:
         assert running.set("skeleton_filter", filter=name) == [(True, "")]
         assert running.until(lambda first=first: running.angles and first in running.angles[-1].name, 60.0), (
             name,
-            running.diagnostics["joint_angles"],
+            running.diagnostics,
         )
 
 
@@ -176,7 +176,7 @@ def test_another_convention_holds_for_every_filter(running: Graph) -> None:
     assert running.set("joint_angles", convention="isb") == [(True, "")]
     for name, source in (("lkf_constant_velocity", "skeleton"), ("ekf", "model_state")):
         assert running.set("skeleton_filter", filter=name) == [(True, "")]
-        assert running.until(lambda s=source: running.diagnostics["joint_angles"][""] == f"isb angles of {s}", 60.0)
+        assert running.until(lambda s=source: running.said("joint_angles").get("", "") == f"isb angles of {s}", 60.0)
         running.angles.clear()
         assert running.until(lambda: running.angles and "thorax_extension_body1" in running.angles[-1].name, 60.0)
     assert running.set("joint_angles", convention="auto") == [(True, "")]
@@ -186,7 +186,7 @@ def test_an_input_that_the_filter_does_not_publish_is_reported(running: Graph) -
     assert running.set("skeleton_filter", filter="lkf_zero_velocity") == [(True, "")]
     assert running.set("joint_angles", input="model_state") == [(True, "")]
     assert running.until(
-        lambda: "no filter publishes /filtered/model_covariance" in running.diagnostics["joint_angles"][""]
+        lambda: "no filter publishes /filtered/model_covariance" in running.said("joint_angles").get("", "")
     )
     assert running.set("joint_angles", input="auto") == [(True, "")]
     running.angles.clear()
@@ -210,6 +210,6 @@ def test_the_recorder_changes_its_bag_between_two_recordings_only(running: Graph
     assert running.call(Trigger, "/recorder/stop", Trigger.Request()).success
     assert running.set("bag_recorder", folder=second) == [(True, "")]
     assert running.call(Trigger, "/recorder/start", Trigger.Request()).success
-    assert running.until(lambda: running.diagnostics["bag_recorder"].get("bag") == str(second))
+    assert running.until(lambda: running.said("bag_recorder").get("bag") == str(second))
     assert running.call(Trigger, "/recorder/stop", Trigger.Request()).success
     assert {path.suffix for folder in (first, second) for path in folder.iterdir()} == {".mcap", ".yaml"}

@@ -130,7 +130,7 @@ def stamps(messages: list[Any]) -> list[int]:
 def test_filter_publishes_only_after_the_calibration(tracking: Tracking) -> None:
     tracking.play(10)
     assert tracking.until(lambda: "10" in tracking.diagnostics.get("skeleton_filter", {}).get("received", ""))
-    assert tracking.until(lambda: tracking.diagnostics["skeleton_filter"].get("alignment uncalibrated") == "10"), (
+    assert tracking.until(lambda: tracking.said("skeleton_filter").get("alignment uncalibrated") == "10"), (
         tracking.diagnostics
     )
     assert not tracking.skeletons
@@ -200,7 +200,7 @@ def test_without_inputs_the_filter_predicts_and_then_stops(tracking: Tracking) -
     lasted = predicted[-1].stamp_ns - predicted[0].stamp_ns
     assert 1.0 * NANOSECONDS <= lasted <= 1.8 * NANOSECONDS
     assert len(set(stamps(tracking.angles)) & {each.stamp_ns for each in predicted}) >= 10
-    assert int(tracking.diagnostics["skeleton_filter"]["predicted frames"]) >= len(predicted)
+    assert tracking.number("skeleton_filter", "predicted frames") >= len(predicted)
     assert predicted[0].covariances is not None
     assert predicted[-1].covariances is not None
     hand = Joint.HAND_LEFT

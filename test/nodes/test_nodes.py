@@ -173,7 +173,7 @@ def test_every_malformed_message_is_counted(nodes: Running, topic: str) -> None:
     assert [nodes.number(name, "malformed") for name in readers] == [len(MALFORMED)] * len(readers)
     for name in readers:
         assert nodes.processes[name].poll() is None
-        assert topic in nodes.diagnostics[name]["last malformed"]
+        assert topic in nodes.said(name).get("last malformed", "")
         assert "malformed message ignored" in nodes.log(name)
     publisher.publish(valid())
     assert nodes.until(lambda: all(nodes.number(name, "received") >= 1 for name in readers))
@@ -250,7 +250,7 @@ def test_a_t_pose_that_is_held_is_logged(nodes: Running) -> None:
     for frame in held:
         publisher.publish(skeletons_to_cloud([replace(frame, stamp_ns=begin + frame.stamp_ns - first)], ROS))
         nodes.executor.spin_once(timeout_sec=0.005)
-    assert nodes.until(lambda: nodes.diagnostics["skeleton_filter"].get("t_poses") == "1")
+    assert nodes.until(lambda: nodes.said("skeleton_filter").get("t_poses") == "1")
     assert nodes.until(lambda: "estimated from a T-pose" in nodes.log("skeleton_filter"))
     nodes.node.destroy_publisher(publisher)
 
@@ -341,7 +341,7 @@ def test_backend_of_another_package_is_found_and_its_failure_reported(tmp_path: 
         process = running.start_interpreter("kinect_skeleton", backend="mine")
         failure = "OSError: the cable was pulled"
         assert running.until(lambda: running.said("kinect_skeleton").get("") == failure, 60.0)
-        assert running.diagnostics["kinect_skeleton"]["published"] == "3"
+        assert running.said("kinect_skeleton").get("published", "") == "3"
         assert "in read" in running.log("kinect_skeleton")  # where, for who writes it
         assert process.poll() is None
         assert stop(process) == 0
@@ -352,7 +352,7 @@ def test_backend_whose_status_raises_keeps_publishing(tmp_path: Path) -> None:
         running.environment |= installed(tmp_path, "mycamera:Mute")
         process = running.start_interpreter("kinect_skeleton", backend="mine")
         assert running.until(lambda: running.said("kinect_skeleton").get("published") == "3", 60.0)
-        assert running.diagnostics["kinect_skeleton"][""] == "streaming; counters: KeyError: 'temperature'"
+        assert running.said("kinect_skeleton").get("", "") == "streaming; counters: KeyError: 'temperature'"
         assert "in counters" in running.log("kinect_skeleton")
         assert stop(process) == 0
         assert "OSError: closed twice" in running.log("kinect_skeleton")
