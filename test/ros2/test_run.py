@@ -28,7 +28,7 @@ class AllNodes:
         self.tools = tools
         bag, mapping = tools.bag(), tools.share / "config" / "robots" / "iiwa7.yaml"
         parameters: dict[str, dict[str, object]] = {
-            "kinect_skeleton": {"sensor": "kinect1", "file": bag, "loop": "true"},
+            "kinect_skeleton": {"sensor": "kinect1", "file": bag},
             "imu_skeleton": {"segments": "[forearm_left]"},
             "robot_commands": {"mapping": mapping},
             "bag_player": {"bag": bag, "topics": "[/kinect2/skeleton]", "start_paused": "true"},
