@@ -262,7 +262,7 @@ def two_people(folder: Path) -> tuple[Path, Path]:
             "walking_and_turning",
             around(np.radians([25.0, -35.0]).tolist(), distances=2.7),
             number=2,
-            seconds=8.0,
+            seconds=6.0,
             standard=True,
             places=lanes(2),
         )

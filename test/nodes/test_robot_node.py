@@ -365,7 +365,7 @@ def test_an_arm_follows_two_sensors_through_the_whole_graph_and_holds_when_they_
         angles: list[tuple[float, JointState]] = []
         topic = graph.joint_states_topic("body1")
         robots.node.create_subscription(JointState, topic, lambda each: angles.append((time.time(), each)), RELIABLE)
-        words = ["--bag", BAG, "--filter", "ekf", "--robot", mapping_file("two_joint_arm"), "--log-dir", tmp_path]
+        words = ["--bag", BAG, "--robot", mapping_file("two_joint_arm"), "--log-dir", tmp_path]
         up = robots.start_module("up", "body_tracking.cli", "up", *words)
 
         def state() -> str | None:

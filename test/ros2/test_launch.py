@@ -27,13 +27,13 @@ def test_a_recording_becomes_angles_and_filter_and_convention_may_change_meanwhi
         return tools.bench.until(lambda: [each for each in angles if each.header.frame_id == convention], SOON)
 
     assert comes("model"), launch.text()
-    assert "lumbar_flexion_body1" in tools.ask("topic", "echo", "--once", ANGLES, NO_DAEMON, "--spin-time", "3")
+    tools.ask("lumbar_flexion_body1", "topic", "echo", "--once", ANGLES, NO_DAEMON, "--spin-time", "3")
     for node, parameter, value, convention in (
         ("/skeleton_filter", "filter", "lkf_zero_velocity", "positional"),
         ("/skeleton_filter", "filter", "ekf", "model"),
         ("/joint_angles", "convention", "isb", "isb"),
     ):
-        assert "successful" in tools.ask("param", "set", node, parameter, value, NO_DAEMON, "--timeout", "20")
+        tools.ask("successful", "param", "set", node, parameter, value, NO_DAEMON, "--timeout", "10")
         assert comes(convention), launch.text()
     angles.clear()
     assert not tools.bench.until(lambda: [each for each in angles if each.header.frame_id != "isb"], 1.0)
@@ -47,12 +47,12 @@ def test_a_recording_becomes_angles_and_filter_and_convention_may_change_meanwhi
 
 def test_a_rig_in_a_namespace_keeps_its_topics_there_and_ends_with_its_bag(tools: Tools, wave: Path) -> None:
     angles = tools.bench.collect(JointState, f"/lab{ANGLES}")
-    launch = tools.launch(f"bag:={wave}", "namespace:=lab", "record:=live", "rate:=0.7")
+    launch = tools.launch(f"bag:={wave}", "namespace:=lab", "record:=live", "rate:=0.4")
     assert tools.bench.until(lambda: angles, SOON), launch.text()
     names = {name for name, _ in tools.bench.node.get_topic_names_and_types()}
     assert {f"/lab{graph.FUSED}", f"/lab{graph.FILTERED}", f"/lab{graph.CALIBRATION}"} <= names
     assert not [name for name in names - WHOLE_DOMAIN if not name.startswith("/lab/")]
-    assert "success=True" in tools.ask("service", "call", "/lab/calibration/start", "std_srvs/srv/Trigger")
+    tools.ask("success=True", "service", "call", "/lab/calibration/start", "std_srvs/srv/Trigger")
     assert launch.ended() == 0, launch.text()
     assert "Traceback" not in launch.text() and "[ERROR]" not in launch.text()
     with BagReader(tools.folder / "live") as bag:

@@ -59,14 +59,13 @@ def test_every_node_publishes_diagnostics(all_nodes: AllNodes) -> None:
 
 
 def test_every_service_answers(all_nodes: AllNodes) -> None:
-    calls = [
-        ("service", "call", f"/{name}", "std_srvs/srv/Trigger") for name in [each.name for each in systems.SERVICES]
-    ]
+    services = [each.name for each in systems.SERVICES]
     # The recorder is to start before it stops.
-    first, later = [call for call in calls if "start" in call[2]], [call for call in calls if "start" not in call[2]]
-    for text in (*all_nodes.tools.all(first), *all_nodes.tools.all(some(later, 3))):
-        answer = text.partition("response:")[2]
-        assert "success=True" in answer or ("success=False" in answer and "message=''" not in answer), text
+    first, later = [name for name in services if "start" in name], [name for name in services if "start" not in name]
+    for name in (*first, *some(later, 3)):
+        said = all_nodes.tools.ask("success=", "service", "call", f"/{name}", "std_srvs/srv/Trigger")
+        answer = said.partition("response:")[2]
+        assert "success=True" in answer or ("success=False" in answer and "message=''" not in answer), said
 
 
 def test_ctrl_c_ends_every_node_in_order(all_nodes: AllNodes) -> None:

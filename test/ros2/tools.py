@@ -7,7 +7,7 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -125,18 +125,23 @@ class Tools:
         words = [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
         return self.start("run", "body_tracking", executable, *arguments, *(["--ros-args", *words] if words else []))
 
-    def all(self, commands: Iterable[Sequence[str | Path]], timeout: float = 60.0) -> list[str]:
-        """What several prints, each of which succeeds; they run at once."""
-        tools = [self.start(*words) for words in commands]
-        end = time.monotonic() + timeout
-        for tool in tools:
-            assert tool.ended(max(0.1, end - time.monotonic())) == 0, tool.text()
-        return [tool.text() for tool in tools]
+    def ask(self, wanted: str, *words: str | Path, timeout: float = 120.0) -> str:
+        """What a command prints, which is repeated until that contains something, as its user would.
 
-    def ask(self, *words: str | Path) -> str:
-        """What a command prints that succeeds."""
-        (text,) = self.all([words])
-        return text
+        On a busy machine it may look for a node too briefly, and a service may answer before it knows whom: DDS then
+        drops the response, and the command waits for it for ever.
+        """
+        end, said = time.monotonic() + timeout, ""
+        while time.monotonic() < end:
+            tool = self.start(*words)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                tool.process.wait(20.0)
+            kill(tool.process.pid)
+            tool.process.wait()
+            said = tool.text()
+            if wanted in said:
+                return said
+        raise AssertionError(f"{words}: no {wanted!r} in: {said}")
 
 
 NO_DAEMON = "--no-daemon"
