@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from body_tracking.core.skeleton import N_JOINTS, FloatArray
-from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
+from body_tracking.filters.ekf.filter import ExtendedKalmanFilter
+from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.kinematics.upper_body import UNOBSERVED
 from body_tracking.simulation.random_people import (
     MODEL,

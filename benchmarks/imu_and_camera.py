@@ -27,7 +27,8 @@ from body_tracking.core import so3
 from body_tracking.core.orientation import SegmentOrientation
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, Joint, Skeleton
 from body_tracking.evaluation.segments import segment_frames
-from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
+from body_tracking.filters.ekf.filter import ExtendedKalmanFilter
+from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.fusion.alignment import SensorAlignment
 from body_tracking.inertial.simulated import ImuSamples, SimulatedImu, usual_mounting
 from body_tracking.inertial.tracking import rate_variance

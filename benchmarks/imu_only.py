@@ -25,7 +25,7 @@ from common import rms_deg
 from body_tracking.core import so3
 from body_tracking.core.imu import ImuSample
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
-from body_tracking.filters.ekf import ExtendedKalmanFilter
+from body_tracking.filters.ekf.filter import ExtendedKalmanFilter
 from body_tracking.inertial.parameters import TrackingParameters
 from body_tracking.inertial.simulated import ImuSamples, SimulatedImu, usual_mounting
 from body_tracking.inertial.tracking import InertialTracker

@@ -30,7 +30,8 @@ from body_tracking.core.measurement import left_right_axes
 from body_tracking.core.message_types import TRANSFORM
 from body_tracking.core.sensor_poses import CalibrationResult
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, IntArray, Skeleton
-from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
+from body_tracking.filters.ekf.filter import ExtendedKalmanFilter
+from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.fusion.alignment import SensorAlignment
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.calibration import transform_to_pose

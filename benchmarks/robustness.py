@@ -32,7 +32,8 @@ import numpy as np
 from honesty import NAMES, OBSERVED, Settings, all_runs, new_filter
 
 from body_tracking.core.skeleton import BoolArray, FloatArray
-from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
+from body_tracking.filters.ekf.filter import ExtendedKalmanFilter
+from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UNOBSERVED
 from body_tracking.simulation.random_people import (

@@ -18,9 +18,9 @@ ABSENT = {
     "nodes.robot_commands": {"scipy", "matplotlib"},
     "nodes.kinect_skeleton": {"scipy", "matplotlib"},
     "nodes.viewer": {"scipy", "matplotlib"},
-    "nodes.calibration": {"scipy.signal", "scipy.spatial", "scipy.optimize", "scipy.stats", "matplotlib"},
-    "nodes.fusion": {"scipy.spatial", "scipy.optimize", "scipy.stats", "matplotlib", "filterpy"},
-    "nodes.skeleton_filter": {"scipy.optimize", "scipy.stats", "matplotlib", "filterpy"},
+    "nodes.calibration": {"scipy", "matplotlib"},
+    "nodes.fusion": {"scipy", "matplotlib", "filterpy"},
+    "nodes.skeleton_filter": {"scipy", "matplotlib", "filterpy"},
 }
 """Libraries that a module leaves out. One Python imports the modules in this order, so the strictest come first."""
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import correlate1d, minimum_filter1d
 
+from body_tracking.calibration import moving
 from body_tracking.calibration.clock_correlation import STEP, Series, correlate
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
 
@@ -86,8 +86,8 @@ def joint_speeds(stamps: FloatArray, positions: FloatArray) -> Series:
     value = np.where(known, value, mean[:, None])
     # Interpolation half-way between independent samples halves their noise and would bias the offset towards it;
     # smoothing correlates neighbours.
-    value = correlate1d(value, _SMOOTHING, axis=0, mode="nearest")
-    good = minimum_filter1d(good, len(_SMOOTHING))
+    value = moving.weighted(value.T, _SMOOTHING).T
+    good = moving.all_in(good, len(_SMOOTHING))
     return Series(0.5 * (stamps[_SPAN:] + stamps[:-_SPAN]), value, good)
 
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import correlate1d
 
+from body_tracking.calibration import moving
 from body_tracking.core.clocks import ClockModel, clock_of_line, line_information
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray
 
@@ -257,7 +257,7 @@ class ClockFit:
         drifts = _DRIFT_STEP * np.arange(-_DRIFT_STEPS, _DRIFT_STEPS + 1)
         # Newton's method on the smoothed likelihood, from the best point of a coarse grid, on which each window is
         # shifted by whole lags.
-        smooth, slope, bend = (correlate1d(likelihood, row, axis=1, mode="nearest") for row in _LOCAL_QUADRATIC)
+        smooth, slope, bend = (moving.weighted(likelihood, row) for row in _LOCAL_QUADRATIC)
         shifts = np.rint(drifts[:, None] * elapsed / _FINE_STEP).astype(np.intp)
         places = np.clip(np.arange(last + 1) + shifts[..., None], 0, last)
         total = smooth[rows[None, :, None], places].sum(axis=1)

@@ -42,9 +42,9 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from scipy.special import chdtri
 
 from body_tracking.calibration.still_pose import is_t_pose
+from body_tracking.core.chi_square import gate
 from body_tracking.core.measurement import BASE_STDDEV
 from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, IntArray, Joint, Skeleton
 
@@ -430,7 +430,7 @@ class JointCentres:
 
     def _gate(self, dimension: int) -> float:
         if dimension not in self._gates:
-            self._gates[dimension] = float(chdtri(dimension, 1.0 - _GATE_QUANTILE))
+            self._gates[dimension] = gate(dimension, 1.0 - _GATE_QUANTILE)
         return self._gates[dimension]
 
     @staticmethod

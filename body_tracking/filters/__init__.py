@@ -17,15 +17,19 @@ if TYPE_CHECKING:
     from body_tracking.core.skeleton import Skeleton
     from body_tracking.kinematics.upper_body import UpperBody
 
-_LINEAR: Final = ("linear", "LinearKalmanFilter", "LinearKalmanParameters", "")
-# name: module, class, class of its parameters, prefix of their names in the table of all filters
+_LINEAR: Final = ("linear:LinearKalmanFilter", "linear:LinearKalmanParameters", "")
+# name: module and class, those of its parameters, prefix of their names in the table of all filters
 _FILTERS: Final = {
     "lkf_zero_velocity": _LINEAR,
     "lkf_constant_velocity": _LINEAR,
-    "ekf": ("ekf", "ExtendedKalmanFilter", "EkfParameters", "ekf."),
-    "thesis_lkf1": ("thesis", "ThesisLkf1", "ThesisLkfParameters", "thesis_lkf."),
-    "thesis_lkf2": ("thesis", "ThesisLkf2", "ThesisLkfParameters", "thesis_lkf."),
-    "schlagenhauf_ekf": ("schlagenhauf", "SchlagenhaufKalmanFilter", "SchlagenhaufParameters", "schlagenhauf_ekf."),
+    "ekf": ("ekf.filter:ExtendedKalmanFilter", "ekf.parameters:EkfParameters", "ekf."),
+    "thesis_lkf1": ("thesis:ThesisLkf1", "thesis:ThesisLkfParameters", "thesis_lkf."),
+    "thesis_lkf2": ("thesis:ThesisLkf2", "thesis:ThesisLkfParameters", "thesis_lkf."),
+    "schlagenhauf_ekf": (
+        "schlagenhauf:SchlagenhaufKalmanFilter",
+        "schlagenhauf:SchlagenhaufParameters",
+        "schlagenhauf_ekf.",
+    ),
 }
 
 FILTERS: Final = tuple(_FILTERS)
@@ -76,18 +80,19 @@ class ModelFilter(SkeletonFilter, Protocol):
         """The prediction at a later time; None where the person is lost."""
 
 
-def _from(module: str, name: str) -> Any:
-    return getattr(importlib.import_module(f"{__name__}.{module}"), name)
+def _load(name: str) -> Any:
+    module, _, attribute = name.partition(":")
+    return getattr(importlib.import_module(f"{__name__}.{module}"), attribute)
 
 
 def parameter_classes() -> dict[str, type[Any]]:
     """The parameter classes of all filters, by prefix."""
-    return {prefix: _from(module, name) for module, _, name, prefix in _FILTERS.values()}
+    return {prefix: _load(parameters) for _, parameters, prefix in _FILTERS.values()}
 
 
-def _row(name: str) -> tuple[str, str, str, str]:
+def _row(name: str) -> tuple[str, str, str]:
     if name not in _FILTERS:
-        error: type[Exception] = _from("linear", "FilterError")
+        error: type[Exception] = _load("linear:FilterError")
         raise error(f"unknown filter {name!r}, expected one of {', '.join(FILTERS)}")
     return _FILTERS[name]
 
@@ -98,7 +103,7 @@ def parameter_prefix(name: str) -> str:
     Raises:
         FilterError: an unknown name.
     """
-    return _row(name)[3]
+    return _row(name)[2]
 
 
 def make_filter(name: str, **parameters: Any) -> SkeletonFilter:
@@ -111,13 +116,12 @@ def make_filter(name: str, **parameters: Any) -> SkeletonFilter:
     Raises:
         FilterError: an unknown name, an unknown parameter, a value out of range.
     """
-    module, filter_name, parameters_name, _ = _row(name)
-    parameter_class = _from(module, parameters_name)
-    unknown = parameters.keys() - {item.name for item in fields(parameter_class)}
+    filter_class, parameters_class, _ = _row(name)
+    settings_class = _load(parameters_class)
+    unknown = parameters.keys() - {item.name for item in fields(settings_class)}
     if unknown:
-        error: type[Exception] = _from("linear", "FilterError")
+        error: type[Exception] = _load("linear:FilterError")
         raise error(f"filter {name}: unknown parameter(s) {', '.join(sorted(unknown))}")
-    made = _from(module, filter_name)
-    settings = parameter_class(**parameters)
-    result: SkeletonFilter = made(name, settings) if module == "linear" else made(settings)
+    made, settings = _load(filter_class), settings_class(**parameters)
+    result: SkeletonFilter = made(name, settings) if filter_class == _LINEAR[0] else made(settings)
     return result

@@ -23,9 +23,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.special import chdtri
 
 from body_tracking.calibration.joint_centres import JointCentres
+from body_tracking.core.chi_square import gate
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.measurement import BASE_STDDEV, INFERRED_FACTOR
 from body_tracking.core.parameters import check_fields, number_field
@@ -39,7 +39,7 @@ from body_tracking.core.skeleton import (
     TrackingState,
 )
 from body_tracking.filters.arrival import Arrival, Arrivals
-from body_tracking.filters.stacked import Stacked
+from body_tracking.filters.stacked import StackedKalmanFilter
 from body_tracking.kinematics.motion import ACCELERATION_DENSITIES, joint_densities
 
 ZERO_VELOCITY = "lkf_zero_velocity"
@@ -192,7 +192,7 @@ class LinearKalmanParameters:
 
 
 class LinearKalmanFilter:
-    """25 independent linear Kalman filters, run as one stacked :class:`filterpy.kalman.KalmanFilter`.
+    """25 independent linear Kalman filters, run as one :class:`StackedKalmanFilter`.
 
     The process noise of a step of ``dt`` seconds is ``q dt`` (zero velocity: a random walk) or ``q`` times
     [[dt^3/3, dt^2/2], [dt^2/2, dt]] (constant velocity: white acceleration; Bar-Shalom 2001, eq. 6.2.2-12). Both make
@@ -218,8 +218,6 @@ class LinearKalmanFilter:
         Raises:
             FilterError: an unknown model.
         """
-        from filterpy.common import Q_continuous_white_noise  # takes 0.8 s: import only for this filter
-
         if model not in LINEAR_MODELS:
             raise FilterError(f"unknown linear filter {model!r}, expected one of {', '.join(LINEAR_MODELS)}")
         self.model = model
@@ -227,18 +225,18 @@ class LinearKalmanFilter:
         if model == CONSTANT_VELOCITY:
             self._order = 2
             densities = (p.acceleration_density_trunk, p.acceleration_density_limb, p.acceleration_density_extremity)
-            unit_step = Q_continuous_white_noise(2, dt=1.0, block_size=3, order_by_dim=False)
+            unit_step = np.kron([[1.0 / 3.0, 0.5], [0.5, 1.0]], _EYE3)
             powers = np.array([[3.0, 2.0], [2.0, 1.0]])
         else:
             self._order = 1
             densities = (p.velocity_density_trunk, p.velocity_density_limb, p.velocity_density_extremity)
             unit_step, powers = np.eye(3), np.array([[1.0]])
-        # every term is a power of dt: filterpy builds the noise once, for one second, and a step scales it
+        # every term is a power of dt: the noise is built once, for one second, and a step scales it
         self._unit_noise: FloatArray = joint_densities(densities)[:, None, None] * unit_step
         self._noise_powers: FloatArray = np.kron(powers, np.ones((3, 3)))
         # an Ornstein-Uhlenbeck velocity of variance s driven by white noise of density q fades in 2 s / q
         self._fading_time: FloatArray = 2.0 * p.initial_velocity_stddev**2 / joint_densities(densities)
-        self._gate = float(chdtri(3, 1.0 - p.gate_probability))
+        self._gate = gate(3, 1.0 - p.gate_probability)
         self.counters: dict[str, int] = dict.fromkeys(
             ("measured", "predicted", "rejected", "reacquired", "lost", "damaged"), 0
         )
@@ -254,12 +252,9 @@ class LinearKalmanFilter:
 
     def _restart(self) -> None:
         """Forget every joint."""
-        from filterpy.kalman import KalmanFilter
-
         size = 3 * self._order
-        self._kalman = KalmanFilter(dim_x=size, dim_z=3)
-        self._kalman.x = Stacked.of(np.zeros((N_JOINTS, size, 1)))
-        self._kalman.P = Stacked.of(np.broadcast_to(np.eye(size), (N_JOINTS, size, size)).copy())
+        covariances = np.broadcast_to(np.eye(size), (N_JOINTS, size, size)).copy()
+        self._kalman = StackedKalmanFilter(np.zeros((N_JOINTS, size, 1)), covariances)
         self._alive: BoolArray = np.zeros(N_JOINTS, dtype=bool)
         self._slow: FloatArray = np.zeros((N_JOINTS, 3, 3))
         self._level: FloatArray = np.zeros(N_JOINTS)
@@ -354,9 +349,9 @@ class LinearKalmanFilter:
 
         observation = np.zeros((N_JOINTS, 3, size))  # eq. 5.11, 5.12; zero where nothing is observed (eq. 5.21)
         observation[:, :, :3] = observed[:, None, None] * _EYE3
-        measurement = Stacked.of(np.where(observed[:, None], positions, 0.0)[:, :, None])
+        measurement = np.where(observed[:, None], positions, 0.0)[:, :, None]
         white = self.parameters.white_noise_share * noise
-        kalman.update(measurement, R=Stacked.of(white), H=Stacked.of(observation))
+        kalman.update(measurement, R=white, H=observation)
         distances = self._distances()
         self.innovation_distances = np.where(observed, distances, np.nan)
         suspects: BoolArray = np.array(distances > self._gate)
@@ -372,9 +367,9 @@ class LinearKalmanFilter:
         # only little.
         kalman.x, kalman.P = kalman.x_prior, kalman.P_prior
         raised = np.where(suspects[:, None, None], np.exp(self._level)[:, None, None] - scale, 0.0) * noise_of_step
-        kalman.P = Stacked.of(np.asarray(kalman.P_prior) + raised)
+        kalman.P = kalman.P_prior + raised
         noise = np.where(suspects[:, None, None], noise, white)
-        kalman.update(measurement, R=Stacked.of(noise), H=Stacked.of(observation))
+        kalman.update(measurement, R=noise, H=observation)
         rejected: BoolArray = suspects & (self._distances() > self._gate)
         kalman.x[rejected] = kalman.x_prior[rejected]
         kalman.P[rejected] = kalman.P_prior[rejected]
@@ -422,7 +417,7 @@ class LinearKalmanFilter:
         blocks = np.stack([np.stack([tt, tv], axis=-1), np.stack([tv, vv], axis=-1)], axis=-2)
         density = self._unit_noise[:, 3, 3]
         noise = np.where(free[:, None, None], density[:, None, None] * np.kron(blocks, _EYE3), noise)
-        self._kalman.predict(u=Stacked.of(carrying), B=Stacked.of(control), F=Stacked.of(transition), Q=noise)
+        self._kalman.predict(F=transition, Q=noise, control=control @ carrying)
 
     def _carry(self, carrier: IntArray, unseen: BoolArray) -> None:
         """Apply the corrections of the carriers to their unseen joints (25,)."""
@@ -433,8 +428,8 @@ class LinearKalmanFilter:
 
     def _distances(self) -> FloatArray:
         """(25,) squared Mahalanobis distances of the last update's innovations; 0 where nothing was observed."""
-        innovation = np.asarray(self._kalman.y)
-        distances: FloatArray = (innovation * (np.asarray(self._kalman.SI) @ innovation)).sum(axis=(1, 2))
+        innovation = self._kalman.y
+        distances: FloatArray = (innovation * (self._kalman.SI @ innovation)).sum(axis=(1, 2))
         return distances
 
     def _update_ages(self, step: float, measured: BoolArray, rejected: BoolArray) -> None:
@@ -467,7 +462,7 @@ class LinearKalmanFilter:
         state = self._kalman.x[:, :, 0]
         # copies, and plain arrays: the output must not change with the next frame
         positions: FloatArray = np.array(state[:, :3])
-        covariances: FloatArray = np.asarray(self._kalman.P)[:, :3, :3] + self._slow
+        covariances: FloatArray = self._kalman.P[:, :3, :3] + self._slow
         velocities: FloatArray = np.array(state[:, 3:]) if self._order == 2 else np.full((N_JOINTS, 3), np.nan)
         states = np.where(used, skeleton.states, np.uint8(TrackingState.INFERRED))
         if not alive.all():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from numpy.testing import assert_allclose
 
 from body_tracking.core.estimate import ModelEstimate
-from body_tracking.filters.ekf import ExtendedKalmanFilter
+from body_tracking.filters.ekf.filter import ExtendedKalmanFilter
 
 
 def known(estimator: ExtendedKalmanFilter) -> ModelEstimate:

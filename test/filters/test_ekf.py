@@ -24,7 +24,8 @@ from body_tracking.core.skeleton import (
     Skeleton,
     TrackingState,
 )
-from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
+from body_tracking.filters.ekf.filter import ExtendedKalmanFilter
+from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.kinematics.conventions import angles_of
 from body_tracking.kinematics.posture import PosturePrior
 from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV, Ranges

@@ -19,8 +19,9 @@ from body_tracking.core import so3
 from body_tracking.core.body_model import SEGMENTS
 from body_tracking.core.orientation import SEGMENT_NUMBER, SegmentOrientation
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton
-from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
 from body_tracking.filters.ekf import sources as orientation
+from body_tracking.filters.ekf.filter import ExtendedKalmanFilter
+from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.sources import PER_SOURCE, Sources
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UNOBSERVED

@@ -25,8 +25,3 @@ sources of orientations (``sensor_errors``, ``sources``), updates by frames (``s
 (``orientations``), prior knowledge (``priors``), search for another pose (``poses``), output (``displacement``,
 ``output``), small matrices (``algebra``), and the filter over time (``filter``).
 """
-
-from body_tracking.filters.ekf.filter import ExtendedKalmanFilter
-from body_tracking.filters.ekf.parameters import EkfParameters
-
-__all__ = ["EkfParameters", "ExtendedKalmanFilter"]

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from scipy.special import chdtri
-
+from body_tracking.core import chi_square
 from body_tracking.core.parameters import check_fields, number_field
 from body_tracking.filters.ekf.sources import OrientationParameters
 from body_tracking.filters.linear import T_POSE, FilterError
@@ -103,4 +102,4 @@ class EkfParameters(OrientationParameters):
     @property
     def gate(self) -> float:
         """The squared Mahalanobis distance of three numbers from which on they are rejected."""
-        return float(chdtri(3, 1.0 - self.gate_probability))
+        return chi_square.gate(3, 1.0 - self.gate_probability)
