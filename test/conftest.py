@@ -19,7 +19,7 @@ from draws import ALL, draws
 
 ROOT = Path(__file__).resolve().parent.parent
 # one set of examples in `make test`, so that a change is to blame when it fails; others each time in `make test-all`
-settings.register_profile("busy machine", deadline=None, derandomize=not ALL, max_examples=draws(40, 100))
+settings.register_profile("busy machine", deadline=None, derandomize=not ALL, max_examples=draws(15, 100))
 settings.load_profile("busy machine")
 dds.prepare()  # what tests send is sent again as soon as what nodes send
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

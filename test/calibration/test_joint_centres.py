@@ -86,7 +86,7 @@ def test_offsets_turn_as_the_frames_of_the_segments_do() -> None:
     assert_allclose(axes.swapaxes(-1, -2)[:, of_thorax], frames[:, of_thorax], atol=1e-9)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(deadline=None, max_examples=draws(12, 30))
 @given(st.tuples(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0), st.floats(-3.0, 3.0)), st.integers(0, len(POSES) - 1))
 def test_offsets_turn_with_the_body(turn: tuple[float, float, float], pose: int) -> None:
     rotation = Rotation.from_rotvec(turn).as_matrix()

@@ -27,6 +27,7 @@ from body_tracking.evaluation.plug_in_gait import (
     read_plug_in_gait,
 )
 from body_tracking.evaluation.smoothing import LONGEST_GAP, fill_gaps, smooth
+from draws import draws
 
 RATE = 100.0
 RADIUS = 0.007
@@ -211,7 +212,7 @@ def test_there_is_no_chord_to_a_joint_that_is_too_near() -> None:
     assert np.isnan(chord(0.2, 0.1 * X, 0.0 * X, Z)).all()
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=draws(12, 50), deadline=None)
 @given(
     elevation=st.floats(0.1, 2.8),
     plane=st.floats(-0.2, 1.8),
@@ -271,7 +272,7 @@ def test_hips_are_symmetric_behind_and_below_the_spines_of_the_ilium() -> None:
         assert positions[0, Joint.SPINE_BASE] == pytest.approx(0.5 * (left + right))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=draws(12, 30), deadline=None)
 @given(
     coefficients=st.lists(points, min_size=4, max_size=4),
     rate=st.sampled_from((50.0, 100.0, 120.0)),

@@ -18,6 +18,7 @@ from body_tracking.evaluation.segments import segment_frames
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.pipeline import graph
 from body_tracking.recording.rosbag2 import BagReader
+from draws import draws
 
 TWIST = Path(__file__).resolve().parents[2] / "bags" / "tpose_torso_twist"
 TRUNK = ("SPINE", "NECK", "HEAD", "SHOULDER", "HIP")
@@ -31,7 +32,7 @@ def twist() -> tuple[FloatArray, FloatArray]:
     return np.array([each.stamp for each in skeletons]), np.stack([each.positions for each in skeletons])
 
 
-@settings(deadline=None, max_examples=30)
+@settings(deadline=None, max_examples=draws(12, 30))
 @given(st.tuples(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0), st.floats(-3.0, 3.0)))
 def test_frames_are_rotations_that_turn_with_the_body(turn: tuple[float, float, float]) -> None:
     positions = twist()[1][::20]

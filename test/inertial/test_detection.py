@@ -22,6 +22,7 @@ from body_tracking.inertial.detection import (
 )
 from body_tracking.inertial.simulated import usual_mounting
 from body_tracking.kinematics.upper_body import UpperBody
+from draws import draws
 
 MODEL = UpperBody()
 WORN = ("upper_trunk", "upper_arm_left", "forearm_left", "upper_arm_right", "forearm_right")
@@ -62,7 +63,7 @@ def held(rng: np.random.Generator, order: list[int]) -> FloatArray:
     return (yaw(rng.uniform(-3.0, 3.0)) @ measured)[order]
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=draws(8, 15), deadline=None)
 @given(st.integers(0, 2**31), st.sampled_from([[0, 1, 2, 3, 4], LEFT_RIGHT]))
 def test_a_pose_of_sensors_with_magnetometers_tells_left_from_right(seed: int, order: list[int]) -> None:
     measured = held(np.random.default_rng(seed), order)
@@ -72,7 +73,7 @@ def test_a_pose_of_sensors_with_magnetometers_tells_left_from_right(seed: int, o
         assert name.endswith(WORN[order[number]].rpartition("_")[2])
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=draws(8, 15), deadline=None)
 @given(st.integers(0, 2**31))
 def test_a_t_pose_of_both_forearms_alone_exchanges_nothing(seed: int) -> None:
     """The same pose half a turn on has left and right exchanged: nothing says which way the person faces."""
@@ -94,7 +95,7 @@ def test_limbs_that_move_alike_are_not_exchanged() -> None:
         assert assign(WORN[:2], likelihood_by_motion(alike[:2], alike[2:])) == WORN[:2]
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=draws(8, 15), deadline=None)
 @given(st.integers(0, 2**31))
 def test_a_pose_of_sensors_with_headings_of_their_own_tells_the_trunk_from_an_arm(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -135,7 +135,7 @@ def test_an_elbow_holds_two_headings_together_and_what_they_share_drifts(seed: i
     assert abs(apart @ error) < 3.5 * np.sqrt(apart @ covariance @ apart)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=draws(8, 15), deadline=None)
 @given(SEEDS)
 def test_a_limit_pulls_back_only_what_is_beyond_it(seed: int) -> None:
     wearer = Wearer(seed, 0.2, np.radians(15.0))

@@ -23,6 +23,7 @@ from body_tracking.inertial.alignment import (
     yaw,
 )
 from body_tracking.kinematics.upper_body import UpperBody
+from draws import draws
 
 MODEL = UpperBody()
 WORN = ("pelvis", "upper_trunk", "upper_arm_left", "forearm_left", "upper_arm_right", "forearm_right")
@@ -59,7 +60,7 @@ def test_the_poses_are_what_people_call_them() -> None:
         pose_rotations(MODEL, "x")  # type: ignore[arg-type]
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=draws(8, 20), deadline=None)
 @given(SEEDS, st.sampled_from(["t", "n"]))
 def test_a_pose_held_exactly_with_known_mountings_gives_them_back_and_the_headings(seed: int, kind: str) -> None:
     rng = np.random.default_rng(seed)

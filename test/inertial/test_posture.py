@@ -11,6 +11,7 @@ from body_tracking.core.skeleton import FloatArray
 from body_tracking.inertial.posture import OrientationKinematics
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.simulation.random_people import RandomMotion
+from draws import draws
 
 MODEL = UpperBody()
 LENGTHS = MODEL.default_lengths()
@@ -26,7 +27,7 @@ def sharp(count: int, degrees: float = 0.05) -> FloatArray:
     return np.broadcast_to(np.radians(degrees) ** 2 * np.eye(3), (count, 3, 3))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=draws(12, 25), deadline=None)
 @given(SEEDS)
 def test_all_segments_give_the_configuration_back(seed: int) -> None:
     q = configuration(seed)
@@ -39,7 +40,7 @@ def test_all_segments_give_the_configuration_back(seed: int) -> None:
     assert np.degrees(np.sqrt(covariance.diagonal()[3:])).max() < 0.5
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=draws(8, 15), deadline=None)
 @given(SEEDS)
 def test_errors_are_within_what_is_stated_and_what_no_sensor_sees_keeps_its_range(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from body_tracking.core.skeleton import JOINT_NAMES, TrackingState
 from body_tracking.core.sources import NOT_FINITE, SensorNameError
 from body_tracking.kinect.csv_recording import BACKWARDS, IGNORED, REPEATED, CsvError, CsvRecording
+from draws import draws
 from skeleton_files import COORDINATES, write_csv
 from skeleton_files import csv_row as row
 
@@ -42,7 +43,7 @@ def test_coordinates_become_optical_and_stamps_stay_exact(tmp_path, name):
     assert (skeleton.states == TrackingState.TRACKED).all()
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=draws(8, 20), deadline=None)
 @given(st.permutations([*COORDINATES, *STATES, "stamp", "sensor", "received", "person", "task", "mood"]), st.data())
 def test_columns_may_come_in_any_order(tmp_path_factory, columns, data):
     states = data.draw(st.lists(st.integers(0, 2), min_size=25, max_size=25))

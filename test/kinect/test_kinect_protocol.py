@@ -19,6 +19,7 @@ from senders import KEY, body
 from body_tracking.core.skeleton import N_JOINTS
 from body_tracking.kinect import kinect_protocol as protocol
 from body_tracking.kinect.kinect_protocol import Body, ClockTimes, Frame, Header, ProtocolError
+from draws import draws
 
 HEADER = Header(protocol.FRAME, "kinect1", 2**64 - 1, 1, -5)
 NAMES = st.from_regex(r"[A-Za-z][A-Za-z0-9_]{0,31}", fullmatch=True)
@@ -44,7 +45,7 @@ def frames(draw: st.DrawFn) -> Frame:
     return Frame(draw(INT64), tuple(bodies), floor, draw(st.booleans()))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=draws(12, 25), deadline=None)
 @given(frames(), NAMES, UINT64, UINT64, INT64, st.binary(min_size=16, max_size=80))
 def test_a_frame_comes_out_as_it_went_in(
     frame: Frame, name: str, session: int, sequence: int, sent_ns: int, key: bytes

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from body_tracking.core.skeleton import TrackingState
 from body_tracking.core.sources import NOT_FINITE
 from body_tracking.kinect.ntu import EMPTY, NtuError, NtuRecording, sensor_of
+from draws import draws
 from skeleton_files import FIRST_ID, skeleton_text
 
 NAME = "S001C002P003R001A010.skeleton"
@@ -29,7 +30,7 @@ def write(path: Path, text: str) -> Path:
     return path
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=draws(12, 25), deadline=None)
 @given(st.lists(st.lists(st.integers(FIRST_ID, FIRST_ID + 4), max_size=3, unique=True), min_size=1, max_size=6))
 def test_the_whole_content_of_the_file_is_read(tmp_path_factory, sequence):
     generator = np.random.default_rng(0)

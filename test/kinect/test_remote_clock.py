@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.kinect.remote_clock import CaptureClock, RoundTrips
+from draws import draws
 
 MS = 1_000_000
 FRAME_NS = NANOSECONDS // 30
@@ -31,7 +32,7 @@ def true_offset(local_ns: int, offset_ns: float, drift: float) -> float:
     return offset_ns + drift * local_ns
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=draws(8, 20), deadline=None)
 @given(
     st.integers(-(10**18), 10**18),
     st.floats(-1e-4, 1e-4),
@@ -141,7 +142,7 @@ def test_after_a_cut_of_half_a_minute_slow_frames_and_answers_do_not_move_the_st
         assert abs(stamp - true - 20 * MS) < MS // 2
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=draws(12, 50), deadline=None)
 @given(st.integers(0, 2**32), st.floats(-3e-4, 3e-4), st.floats(0.0, 0.5))
 def test_stamps_never_run_backwards(seed: int, drift: float, chance: float) -> None:
     """Neither as the estimate improves, nor where a frame is held up, nor where the sensor begins to count anew."""

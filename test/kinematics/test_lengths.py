@@ -79,7 +79,7 @@ def test_lengths_of_noiseless_points_are_exact() -> None:
         assert_allclose(estimated(times, points).lengths, lengths, rtol=0.0, atol=1e-6)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=draws(8, 20), deadline=None)
 @given(seed=st.integers(0, 10_000))
 def test_lengths_are_invariant_under_rigid_motion(seed: int) -> None:
     rng = np.random.default_rng(seed)

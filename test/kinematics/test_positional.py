@@ -143,7 +143,7 @@ def test_the_trunk_is_a_cardan_sequence(flexion: float, lateral: float, axial: f
 
 
 @given(seed=st.integers(0, 10_000), turn=st.floats(-np.pi, np.pi), shift=st.tuples(*[st.floats(-5, 5)] * 3))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=draws(12, 40), deadline=None)
 def test_turning_and_moving_the_person_changes_nothing(seed: int, turn: float, shift: tuple[float, ...]) -> None:
     positions = bent_pose(seed)
     velocities = np.random.default_rng(seed).normal(size=positions.shape)
@@ -158,7 +158,7 @@ def test_turning_and_moving_the_person_changes_nothing(seed: int, turn: float, s
 
 
 @given(seed=st.integers(0, 10_000))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=draws(12, 40), deadline=None)
 def test_the_mirror_exchanges_left_and_right(seed: int) -> None:
     positions = bent_pose(seed)
     here = positional_angles(skeleton(positions, 0.01))

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from body_tracking.core.body_model import ModelError
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
+from draws import draws
 
 LENGTHS = np.array([0.24, 0.26, 0.18, 0.32, 0.25, 0.17, 0.19, 0.33, 0.26, 0.16])
 TO_WORLD = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -109,7 +110,7 @@ def test_axes_at_the_t_pose_are_those_of_the_tables_not_of_table_3_4(angle: int,
 
 
 @given(theta=angles, length=lengths)
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=draws(12, 50), deadline=None)
 def test_it_is_the_product_of_her_matrices(theta: FloatArray, length: FloatArray) -> None:
     """Positions are eq. 5.18; each segment is rigid with its DH frame and stands on the joint that turns it."""
     frames, at_zero = np.array(dh_frames(theta, length)), np.array(dh_frames(np.zeros(26), length))
@@ -131,7 +132,7 @@ def test_it_is_the_product_of_her_matrices(theta: FloatArray, length: FloatArray
 
 
 @given(theta=angles, length=lengths)
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=draws(12, 50), deadline=None)
 def test_the_jacobians_are_the_central_differences(theta: FloatArray, length: FloatArray) -> None:
     result = PLACED.linearise(theta, length)
     step = 1e-5
@@ -167,7 +168,7 @@ def test_her_ten_joints_observe_20_of_26_angles_and_18_in_the_t_pose() -> None:
 
 
 @given(theta=angles, turn=st.floats(-3.0, 3.0))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=draws(12, 25), deadline=None)
 def test_theta15_and_theta16_are_redundant(theta: FloatArray, turn: float) -> None:
     """Not even the forearm's and the hand's rotations do: one turns as much as the other turns back."""
     opposite = np.zeros(26)

@@ -12,6 +12,7 @@ from small_bags import Stored, messages, write
 
 from body_tracking.recording.player import Playback
 from body_tracking.recording.rosbag2 import BagError, BagReader
+from draws import draws
 
 SECOND = 1_000_000_000
 NOW = 5_000 * SECOND  # any steady clock
@@ -68,7 +69,7 @@ class Run:
         return [(topic, cdr, at) for _, topic, cdr, at in self.sent]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=draws(12, 40), deadline=None)
 @given(
     st.floats(0.01, 500.0),
     st.sampled_from([0.0, 1.0, 100.0, 1000.0]),
@@ -104,7 +105,7 @@ def test_the_clock_ticks_by_the_steady_clock_or_comes_with_messages_only(reader,
     assert [clock_ns for _, clock_ns in run.clock] == [at for *_, at in stored]
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=draws(12, 30), deadline=None)
 @given(st.integers(0, SECOND), st.integers(0, 5 * SECOND))
 def test_a_pause_delays_later_messages_by_its_length(reader, stored, begin, length):
     run = Run(Playback(reader))
@@ -126,7 +127,7 @@ def test_a_pause_delays_later_messages_by_its_length(reader, stored, begin, leng
     assert run.stored == stored
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=draws(12, 30), deadline=None)
 @given(st.integers(0, SECOND), st.integers(0, SECOND // 5), st.floats(0.2, 20.0))
 def test_the_clock_never_runs_ahead_of_messages_that_a_pause_finds_due(reader, stored, begin, late, rate):
     """As where the process was busy: messages were due, but not sent, when somebody paused."""

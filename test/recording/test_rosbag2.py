@@ -390,7 +390,7 @@ def test_a_damaged_chunk_is_named_and_the_rest_is_read(tmp_path):
     assert "damaged chunk at byte" in warning and f"with {len(lost)} message(s), 1." in warning
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=draws(12, 60), deadline=None)
 @given(st.builds(struct.Struct("<BQ").pack, st.integers(0, 255), st.integers(0, 2**64 - 1)) | st.just(b""), st.binary())
 def test_any_bytes_after_the_magic_are_no_crash(head, data):
     with tempfile.TemporaryDirectory() as folder:

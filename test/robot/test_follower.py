@@ -506,7 +506,7 @@ wild = st.tuples(
 """Nanoseconds between two commands; position or None, velocity, deviation and age of angles; how often."""
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=draws(12, 40), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.lists(calm | wild, max_size=12), st.booleans())
 def test_commands_are_within_limits_for_any_sequence_of_events(events: list[Any], alone: bool) -> None:
     follower = Bench(alone=alone, recover_after=0.05, approach=0.1, stop_after=0.3, max_stddev=1.0).follower

@@ -7,12 +7,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from body_tracking.robot.limiter import Limiter
+from draws import draws
 
 LOWER, UPPER = np.array([-1.0, 0.0, -0.1]), np.array([2.0, 1.0, 0.1])
 RATE, ACCELERATION = np.array([1.5, 3.0, 10.0]), np.array([8.0, np.inf, 4.0])
 HOME = np.array([0.0, 0.5, 0.0])
 
-BRIEFLY = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+BRIEFLY = settings(max_examples=draws(12, 40), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 times = st.floats(1e-4, 0.05)
 targets = st.lists(st.floats(-4.0, 4.0), min_size=3, max_size=3).map(np.array)
 moves = st.lists(st.tuples(targets, times, st.floats(0.0, 1.0), st.booleans()), min_size=1, max_size=60)

@@ -15,6 +15,7 @@ from body_tracking.kinematics.conventions import angles_of
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names, state_estimate
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.robot.mapping import RobotMapping, load
+from draws import draws
 
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = {name: angle_names(name) for name in ALL_CONVENTIONS}
@@ -36,7 +37,7 @@ def directions(arm: SimulatedArm, elbow: int, wrist: int) -> tuple[np.ndarray, n
     return parts[0] / np.linalg.norm(parts[0]), parts[1] / np.linalg.norm(parts[1])
 
 
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=draws(12, 30), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     plane=st.floats(-0.4, 1.8),
     elevation=st.floats(0.3, 1.9),

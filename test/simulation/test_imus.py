@@ -26,7 +26,7 @@ from body_tracking.inertial.simulated_errors import (
 from body_tracking.inertial.surroundings import Iron, Surroundings
 from body_tracking.kinematics.trajectories import minimum_jerk
 from body_tracking.simulation.random_people import MODEL, RandomMotion, RandomPerson
-from draws import some
+from draws import draws, some
 
 UP = np.array([0.0, 0.0, 1.0])
 AT_ORIGIN = Mounting(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
@@ -135,7 +135,7 @@ def degrees(value: float) -> float:
 
 
 @given(SEEDS)
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=draws(4, 8), deadline=None)
 def test_at_rest_it_measures_gravity_upwards_and_no_rotation(seed: int) -> None:
     quat = so3.exp(np.random.default_rng(seed).normal(size=3))
     samples = measured(still(quat, np.array([2.0, -1.0, 1.2])), duration=0.3)
@@ -145,7 +145,7 @@ def test_at_rest_it_measures_gravity_upwards_and_no_rotation(seed: int) -> None:
 
 
 @given(st.floats(0.2, 20.0), st.floats(0.0, 0.1))
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=draws(4, 8), deadline=None)
 def test_the_motion_is_asked_for_its_own_time_only(duration: float, phase: float) -> None:
     asked: list[float] = []
 
@@ -160,7 +160,7 @@ def test_the_motion_is_asked_for_its_own_time_only(duration: float, phase: float
 
 
 @given(SEEDS)
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=draws(5, 12), deadline=None)
 def test_rates_and_accelerations_are_the_derivatives_of_the_motion(seed: int) -> None:
     """Up to 5 Hz, off by no more than the next terms of the series over the step h = 0.1 ms.
 
@@ -179,7 +179,7 @@ def test_rates_and_accelerations_are_the_derivatives_of_the_motion(seed: int) ->
 
 
 @given(SEEDS)
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=draws(4, 8), deadline=None)
 def test_all_three_are_measured_in_the_frame_of_the_sensor(seed: int) -> None:
     """A rotated mounting rotates the measurements inversely."""
     motion, turn = Swing.draw(seed), so3.exp(np.random.default_rng(seed).normal(size=3))
@@ -194,7 +194,7 @@ def test_all_three_are_measured_in_the_frame_of_the_sensor(seed: int) -> None:
 
 
 @given(SEEDS, st.floats(-3.0, 3.0), st.floats(-1.5, 1.5))
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=draws(4, 8), deadline=None)
 def test_turned_to_world_the_field_is_the_earths(seed: int, north: float, dip: float) -> None:
     where = Surroundings(dip=dip, north=north)
     samples = measured(Swing.draw(seed), duration=0.5, surroundings=where)
@@ -299,7 +299,7 @@ def test_measurements_are_clipped_to_the_range_and_quantised() -> None:
 
 
 @given(SEEDS)
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=draws(4, 8), deadline=None)
 def test_without_tissue_it_keeps_its_place_on_the_segment(seed: int) -> None:
     errors = replace(IDEAL, misalignment=5.0)
     motion, mounting = Swing.draw(seed), usual_mounting("forearm_right")
@@ -327,7 +327,7 @@ def test_misalignment_is_spread_as_stated() -> None:
 
 
 @given(SEEDS)
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=draws(4, 8), deadline=None)
 def test_at_rest_tissue_sags_by_its_parameter_in_any_pose(seed: int) -> None:
     """And turns it by the sag across the limb over the radius."""
     errors = replace(IDEAL, tissue_sag=0.001, tissue_turn=10.0)
@@ -429,7 +429,7 @@ def test_usual_mountings_point_away_from_the_body_and_mirror_each_other(segment:
 
 
 @given(SEEDS, st.floats(-3.0, 3.0))
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=draws(4, 8), deadline=None)
 def test_at_rest_a_driver_with_magnetometer_knows_its_orientation_to_east_north_up(seed: int, north: float) -> None:
     quat = so3.exp(np.random.default_rng(seed).normal(size=3))
     samples = measured(still(quat), duration=0.5, oriented=True, surroundings=Surroundings(north=north))
@@ -583,7 +583,7 @@ def test_off_and_on_again_it_is_silent_in_between_and_starts_with_other_biases_a
     packet=st.integers(1, 12),
     delay_jitter=st.floats(0.0, 0.2),
 )
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=draws(5, 12), deadline=None)
 def test_stamps_and_receipts_are_ordered_and_stamps_are_of_the_own_clock(
     seed: int, rate_hz: float, offset_ns: int, drift: float, jitter: float, packet: int, delay_jitter: float
 ) -> None:

@@ -26,6 +26,7 @@ from body_tracking.kinect.simulated import (
 )
 from body_tracking.kinect.simulated_joints import DEPTH_PATTERN, SLOW_SCALE, WHITE_SCALE
 from body_tracking.kinect.simulated_sensor import ALONG_RAY, Misreading, SimulatedKinect
+from draws import draws
 
 POSE = level_pose("kinect1")
 PLACE = np.array([2.0, 0.0, -1.1])
@@ -123,7 +124,7 @@ def test_a_body_that_is_not_seen_makes_no_frame() -> None:
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=draws(5, 10), deadline=None)
 def test_states_agree_with_positions(seed: int) -> None:
     positions, states = see(ERRORS, restless(4.0), seed)
     assert np.array_equal(np.isnan(positions).any(axis=2), states == TrackingState.NOT_TRACKED)

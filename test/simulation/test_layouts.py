@@ -11,6 +11,7 @@ from standing import placed, standing
 from body_tracking.core.sensor_poses import SensorPose, level_pose
 from body_tracking.core.skeleton import FloatArray, Joint
 from body_tracking.simulation.layouts import DISTANCE, NUMBERS, Layout, LayoutError, around, layout
+from draws import draws
 
 ANGLES = st.floats(-np.pi, np.pi)
 
@@ -55,7 +56,7 @@ def test_every_sensor_has_the_person_before_it(number: int) -> None:
 
 
 @given(st.lists(ANGLES, min_size=1, max_size=5), st.floats(0.5, 4.5), st.floats(0.0, 3.0))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=draws(12, 40), deadline=None)
 def test_any_layout_has_the_angles_it_was_asked_for(angles: list[float], distance: float, height: float) -> None:
     made = around(angles, distance, height)
     apart = np.radians(azimuths(made)) - angles

@@ -11,6 +11,7 @@ from standing import HANGING, flesh, placed, standing
 
 from body_tracking.core.skeleton import MIRROR, FloatArray, Joint
 from body_tracking.kinect.occlusion import Capsules, obstruction
+from draws import draws
 
 OPTICAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """World axes into those of a sensor that looks along x."""
@@ -66,7 +67,7 @@ def test_the_trunk_never_covers_the_spine() -> None:
 
 
 @given(SEEDS)
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=draws(5, 12), deadline=None)
 def test_a_segment_never_covers_the_joints_at_its_ends(seed: int) -> None:
     rng = np.random.default_rng(seed)
     sight = rng.normal([0.0, 0.0, 2.5], 0.4, (5, 25, 3))
@@ -76,7 +77,7 @@ def test_a_segment_never_covers_the_joints_at_its_ends(seed: int) -> None:
 
 
 @given(SEEDS)
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=draws(5, 12), deadline=None)
 def test_cover_agrees_with_a_search_over_points_on_ray_and_axis(seed: int) -> None:
     rng = np.random.default_rng(seed)
     radius = rng.uniform(0.05, 0.3)
@@ -92,7 +93,7 @@ def test_cover_agrees_with_a_search_over_points_on_ray_and_axis(seed: int) -> No
 
 
 @given(SEEDS)
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=draws(5, 12), deadline=None)
 def test_cover_does_not_depend_on_where_the_sensor_looks(seed: int) -> None:
     rng = np.random.default_rng(seed)
     sight = rng.normal([0.0, 0.0, 2.5], 0.4, (4, 25, 3))

@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from body_tracking.core import so3
 from body_tracking.core.skeleton import Joint
 from body_tracking.simulation.people import MODEL, SEXES, Course, PeopleError, Person, joints
+from draws import draws
 
 seeds = st.integers(0, 2**32 - 1)
 SIDES = (Joint.HIP_LEFT, Joint.HIP_RIGHT)
@@ -70,7 +71,7 @@ def test_the_capsules_have_the_persons_mass(seed: int) -> None:
     assert 0.18 < mass / person.mass < 0.20
 
 
-@settings(max_examples=15)
+@settings(max_examples=draws(8, 15))
 @given(seeds)
 def test_knees_are_where_thigh_and_shank_reach_and_bend_forward(seed: int) -> None:
     rng = np.random.default_rng(seed)

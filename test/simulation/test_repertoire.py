@@ -21,7 +21,7 @@ from body_tracking.simulation.repertoire import (
     RepertoireError,
     make_movement,
 )
-from draws import some
+from draws import draws, some
 
 RANGES = Ranges(MODEL)
 FREE = ("walking_and_turning", "standing_still", "random")
@@ -79,14 +79,14 @@ def shoulder_yaw(positions: FloatArray) -> FloatArray:
     return np.degrees(np.unwrap(np.arctan2(-line[:, 0], line[:, 1])))
 
 
-@settings(max_examples=15)
+@settings(max_examples=draws(8, 15))
 @given(names, seeds)
 def test_no_angle_leaves_its_range(name: str, seed: int) -> None:
     _, movement = performance(name, seed)
     assert np.abs(RANGES.excess(watched(movement).q)).max() == 0.0
 
 
-@settings(max_examples=15)
+@settings(max_examples=draws(8, 15))
 @given(names, seeds)
 def test_bones_keep_their_lengths(name: str, seed: int) -> None:
     person, movement = performance(name, seed)
@@ -96,7 +96,7 @@ def test_bones_keep_their_lengths(name: str, seed: int) -> None:
     assert_allclose(lengths, np.broadcast_to(lengths[0], lengths.shape), atol=1e-9)
 
 
-@settings(max_examples=15)
+@settings(max_examples=draws(8, 15))
 @given(names, seeds)
 def test_feet_are_never_below_the_floor_and_stay_where_they_stand(name: str, seed: int) -> None:
     person, movement = performance(name, seed)
@@ -132,7 +132,7 @@ def test_accelerations_are_continuous(name: str) -> None:
     assert largest[1] < 1.6 * largest[0]
 
 
-@settings(max_examples=12)
+@settings(max_examples=draws(5, 12))
 @given(names, seeds)
 def test_people_move_no_faster_than_people(name: str, seed: int) -> None:
     person, movement = performance(name, seed)
@@ -143,7 +143,7 @@ def test_people_move_no_faster_than_people(name: str, seed: int) -> None:
     assert speeds[:, Joint.SPINE_BASE].max() < 2.6
 
 
-@settings(max_examples=15)
+@settings(max_examples=draws(8, 15))
 @given(st.sampled_from([name for name in MOTIONS if name not in FREE]), seeds)
 def test_exercises_begin_and_end_in_a_t_pose(name: str, seed: int) -> None:
     person, movement = performance(name, seed)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.viewing.curves import BAND, WIDEST, AngleHistory, extremes, first_choice
+from draws import draws
 
 NAMES = ("elbow_flexion_left", "trunk_axial")
 STEP_NS = NANOSECONDS // 60
@@ -25,7 +26,7 @@ def filled(count: int, window: float = 1000.0, stddev: float = 0.01) -> AngleHis
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 3), st.integers(1, 400), st.integers(8, 60), st.booleans())
-@settings(max_examples=60)
+@settings(max_examples=draws(12, 60))
 def test_of_many_samples_the_extremes_and_the_ends_are_kept(seed: int, k: int, n: int, count: int, ties: bool) -> None:
     series = np.random.default_rng(seed).normal(scale=2.0, size=(k, n))
     series = np.round(series) if ties else series

@@ -13,6 +13,7 @@ from body_tracking.core.sensor_poses import level_pose
 from body_tracking.core.skeleton import BONES, N_JOINTS, FloatArray, Joint, Skeleton
 from body_tracking.viewing import shapes
 from body_tracking.viewing.colours import INFERRED, NOT_TRACKED, PALETTE, joint_colours, linear
+from draws import draws
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -34,7 +35,7 @@ def spread(rng: np.random.Generator, scale: float = 0.05) -> FloatArray:
 
 
 @given(SEEDS)
-@settings(max_examples=30)
+@settings(max_examples=draws(12, 30))
 def test_an_ellipsoid_is_the_surface_of_its_covariance(seed: int) -> None:
     rng = np.random.default_rng(seed)
     covariances = spread(rng)
