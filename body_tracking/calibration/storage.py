@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from body_tracking.calibration.rigid import CalibrationError
 from body_tracking.core import files
@@ -59,7 +58,7 @@ def save(result: CalibrationResult, path: Path) -> None:
     Raises:
         CalibrationError: the file cannot be written.
     """
-    text = _HEADER + yaml.safe_dump(to_dict(result), sort_keys=False)
+    text = _HEADER + files.dump_yaml(to_dict(result))
     try:
         files.write_text(path, text)
     except files.FileError as error:

@@ -24,6 +24,8 @@ MAX_NUMBER = 100
 SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 """libyaml's where PyYAML was built with it, which is ten times as fast."""
 
+_SafeDumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+
 _OPENING = (yaml.SequenceStartEvent, yaml.MappingStartEvent)
 _CLOSING = (yaml.SequenceEndEvent, yaml.MappingEndEvent)
 _NUMERIC = frozenset("+-.0123456789")
@@ -88,6 +90,17 @@ def write_text(path: Path, text: str) -> None:
         partial.replace(path)
     except OSError as error:
         raise FileError(f"cannot be written ({error.strerror})") from error
+
+
+def dump_yaml(content: Any, **layout: Any) -> str:
+    """``yaml.safe_dump`` in the given order; by libyaml where PyYAML was built with it, which is ten times as fast.
+
+    Args:
+        content: numbers, texts, lists and mappings.
+        layout: ``width`` and ``default_flow_style`` of PyYAML.
+    """
+    text: str = yaml.dump(content, Dumper=_SafeDumper, sort_keys=False, **layout)
+    return text
 
 
 def load_yaml(text: str, loader: Any = SafeLoader, *, aliases: bool = True) -> Any:

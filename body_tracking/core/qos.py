@@ -10,9 +10,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-import yaml
-
-from body_tracking.core.files import FileError, load_yaml
+from body_tracking.core.files import FileError, dump_yaml, load_yaml
 from body_tracking.core.times import NANOSECONDS
 
 INFINITE_NS = 2**63 - 1
@@ -109,12 +107,6 @@ def to_yaml(offers: Sequence[Qos]) -> list[dict[str, Any]]:
             profile[name] = {"sec": sec, "nsec": nsec}
         profiles.append(profile)
     return profiles
-
-
-def dump_yaml(content: Any) -> str:
-    """``yaml.safe_dump`` in the given order; by libyaml where PyYAML was built with it, which is ten times as fast."""
-    text: str = yaml.dump(content, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), sort_keys=False)
-    return text
 
 
 def dump(offers: Sequence[Qos]) -> str:

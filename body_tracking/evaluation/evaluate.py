@@ -19,7 +19,7 @@ from body_tracking.evaluation.marker_reference import (
 from body_tracking.evaluation.pictures import pictures, reference_pictures
 from body_tracking.evaluation.reading import EvaluationError, Recorded, read_estimate, read_markers, read_truth
 from body_tracking.evaluation.reference_comparison import ReferenceEvaluation, evaluate_by_markers
-from body_tracking.evaluation.report import report_of, write
+from body_tracking.evaluation.report import make_folder, report_of, write
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rig import RigReader
 
@@ -139,6 +139,7 @@ def run(args: argparse.Namespace) -> int:
         result = _compare(args)
         report, draw = report_of(result), partial(pictures, result)
     if args.html is not None:
+        make_folder(args.html)
         write(args.html, report.page(draw()).encode())
     print(report.json() if args.json else f"{report.lines()}\n{report.text()}")
     if not args.json:

@@ -271,14 +271,26 @@ def numbered(value: float) -> float | None:
     return round(float(value), 6) if np.isfinite(value) else None
 
 
+def make_folder(path: Path) -> None:
+    """Create the folder of a file that will be written, before the seconds that its content takes.
+
+    Raises:
+        EvaluationError: it cannot be created.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise EvaluationError(f"{path}: {error.strerror or error}") from error
+
+
 def write(path: Path, content: bytes) -> None:
     """Write a file, and create its folder if needed.
 
     Raises:
         EvaluationError: it cannot be written.
     """
+    make_folder(path)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content)
     except OSError as error:
         raise EvaluationError(f"{path}: {error.strerror or error}") from error

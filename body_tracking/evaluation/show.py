@@ -11,7 +11,7 @@ from body_tracking.core.skeleton import FloatArray
 from body_tracking.evaluation.metrics import angle_errors, wrapped
 from body_tracking.evaluation.pictures import are_fine, draw
 from body_tracking.evaluation.reading import AngleSeries, read, true_at
-from body_tracking.evaluation.report import Column, Table
+from body_tracking.evaluation.report import Column, Table, make_folder
 
 
 def summary(angles: AngleSeries, truth: AngleSeries | None = None) -> Table:
@@ -63,6 +63,7 @@ def summarise(bag: Path, png: Path | None = None, body: str | None = None, truth
     """
     tracked = read(bag, body, truth)
     if png is not None:
+        make_folder(png)
         draw(tracked, png)
     return summary(tracked.angles, tracked.true_angles)
 

@@ -8,7 +8,6 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-import yaml
 
 from body_tracking.core import files, so3
 from body_tracking.core.errors import BodyTrackingError
@@ -54,7 +53,7 @@ def save_chain(chain: Chain, path: Path) -> None:
         "sensitivity": chain.sensitivity.tolist(),
         "covariance": [row[: index + 1].tolist() for index, row in enumerate(chain.covariance)],
     }
-    text = _HEADER + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
+    text = _HEADER + files.dump_yaml(content, default_flow_style=None, width=120)
     try:
         files.write_text(path, text)
     except files.FileError as error:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import yaml
 
 from body_tracking.core import files, so3
 from body_tracking.core.camera import MODELS, Camera
@@ -64,7 +63,7 @@ def save_rig(rig: Rig, path: Path) -> None:
         "covariance": rig.covariance[np.tril_indices(rig.size)].tolist(),
     }
     try:
-        files.write_text(path, _HEADER + yaml.safe_dump(content, sort_keys=False, width=120))
+        files.write_text(path, _HEADER + files.dump_yaml(content, width=120))
     except files.FileError as error:
         raise RigFileError(f"{path}: {error}") from error
 

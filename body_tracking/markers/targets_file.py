@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import yaml
 
 from body_tracking.core import files
 from body_tracking.core.errors import BodyTrackingError
@@ -45,7 +44,7 @@ def save_targets(targets: Sequence[Target], path: Path) -> None:
         if target.covariance.any():
             entries[target.name]["covariance"] = target.covariance.tolist()
     try:
-        files.write_text(path, _HEADER + yaml.safe_dump({"targets": entries}, sort_keys=False))
+        files.write_text(path, _HEADER + files.dump_yaml({"targets": entries}))
     except files.FileError as error:
         raise TargetsFileError(f"{path}: {error}") from error
 

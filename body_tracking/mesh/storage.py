@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import yaml
 
 from body_tracking.core import files
 from body_tracking.core.errors import BodyTrackingError
@@ -31,7 +30,7 @@ def save(path: Path, shape: FloatArray, covariance: FloatArray) -> None:
     """
     content = {"shape": shape.round(6).tolist(), "covariance": covariance.round(8).tolist()}
     try:
-        files.write_text(path, _HEADER + yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+        files.write_text(path, _HEADER + files.dump_yaml(content, default_flow_style=None))
     except files.FileError as error:
         raise PersonFileError(f"{path}: {error}") from error
 

@@ -25,7 +25,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 from body_tracking.core import qos as quality
-from body_tracking.core.files import FileError, FileLimitError, load_yaml, open_regular, read_text
+from body_tracking.core.files import FileError, FileLimitError, dump_yaml, load_yaml, open_regular, read_text
 from body_tracking.core.qos import Qos
 from body_tracking.messages.base import BagMessages
 from body_tracking.recording.mcap_file import LIBRARY, McapFile
@@ -598,7 +598,7 @@ def _close_folder(folder: Path) -> None:
     draft = folder / f"{METADATA}.tmp"
     try:
         with draft.open("w", encoding="utf-8") as file:
-            file.write(quality.dump_yaml({"rosbag2_bagfile_information": _information(parts)}))
+            file.write(dump_yaml({"rosbag2_bagfile_information": _information(parts)}))
             file.flush()
             os.fsync(file.fileno())
         draft.replace(folder / METADATA)  # atomic

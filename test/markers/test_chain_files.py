@@ -7,10 +7,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-import yaml
 from marker_people import random_joint, random_posture
 from scipy.spatial.transform import Rotation
 
+from body_tracking.core import files
 from body_tracking.core.joint_angles import JointAngles
 from body_tracking.core.message_types import JOINT_STATE
 from body_tracking.core.skeleton import FloatArray
@@ -69,9 +69,9 @@ def test_a_chain_is_read_as_it_was_written(tmp_path: Path) -> None:
 def test_a_wrong_file_is_refused_by_name(tmp_path: Path, change, named: str) -> None:  # type: ignore[no-untyped-def]
     path = tmp_path / "chain.yaml"
     save_chain(a_chain(np.random.default_rng(2)), path)
-    data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    data = files.read_yaml(path)
     change(data)
-    path.write_text(yaml.safe_dump(data), encoding="utf-8")
+    path.write_text(files.dump_yaml(data), encoding="utf-8")
     with pytest.raises(ChainFileError, match=named) as caught:
         load_chain(path)
     assert str(path) in str(caught.value)
