@@ -45,7 +45,7 @@ from body_tracking.simulation.random_people import (
     observe,
     truth_of,
 )
-from draws import draws
+from draws import draws, some
 
 POINTS = MODEL.joints
 OBSERVED = np.array([number for number, name in enumerate(MODEL.coordinate_names) if name not in UNOBSERVED])
@@ -114,7 +114,7 @@ def assert_sound(outputs: Iterable[Skeleton | None], estimator: ExtendedKalmanFi
 # --- following
 
 
-@pytest.mark.parametrize("noise", [0.005, 0.05])
+@pytest.mark.parametrize("noise", some([0.05, 0.005]))
 def test_it_follows_a_moving_person_closer_than_the_measurements(noise: float) -> None:
     truth = random_truth(1, 2.0)
     estimator = ExtendedKalmanFilter()
@@ -189,7 +189,7 @@ def test_its_uncertainty_is_true() -> None:
     """
     for_angles, for_points, for_lengths = [], [], []
     distance, dimension, frames = 0.0, 0, 0
-    for seed in range(draws(2, 10)):
+    for seed in range(draws(1, 10)):
         truth = random_truth(20 + seed, 4.0)
         observation = measured(truth, 0.01 + 0.005 * (seed % 5), seed)
         estimator = ExtendedKalmanFilter()
@@ -445,7 +445,7 @@ def test_an_older_frame_that_is_repeated_counts_once() -> None:
     skeletons = measured(random_truth(8, 0.4)).skeletons
     once = ExtendedKalmanFilter()
     feed(once, skeletons)
-    for repeated, after in ((0, 4), (0, 5), (0, 8), (2, 5), (5, 8), (9, 12)):
+    for repeated, after in some([(0, 4), (0, 5), (0, 8), (2, 5), (5, 8), (9, 12)], 3):
         twice = ExtendedKalmanFilter()
         feed(twice, skeletons[:after])
         assert twice.update(skeletons[repeated]) is None
@@ -549,7 +549,7 @@ def test_what_is_missing_is_predicted_and_comes_back(missing: tuple[Joint, ...])
 # --- bad data
 
 
-@pytest.mark.parametrize("seed", range(draws(3, 12)))
+@pytest.mark.parametrize("seed", range(draws(2, 12)))
 def test_a_start_that_is_60_degrees_wrong_is_right_within_a_second(seed: int) -> None:
     truth = random_truth(50 + seed, 1.5)
     rng = np.random.default_rng(seed)
@@ -577,7 +577,7 @@ def bent_hands(count: int, seconds: float, bent_at: float = 0.0) -> list[tuple[i
     return found[:count]
 
 
-@pytest.mark.parametrize(("begin", "noise"), [(0.0, 0.006), (0.0, 0.025), (0.7, 0.02)])
+@pytest.mark.parametrize(("begin", "noise"), some([(0.0, 0.025), (0.7, 0.02), (0.0, 0.006)], 2))
 def test_a_hand_turned_over_is_right_soon(begin: float, noise: float) -> None:
     """From the start, or later, as if an unseen movement had ended in the wrong pose: after 1.5 s at most."""
     seconds, end = (1.2, 0.5) if begin == 0.0 else (2.5, 2.2)
@@ -601,7 +601,7 @@ def test_a_hand_turned_over_is_right_soon(begin: float, noise: float) -> None:
 
 def test_an_arm_that_comes_back_elsewhere_is_found_within_two_frames() -> None:
     """After a second unseen, in which it went on briskly: an update linearised where it was can end anywhere."""
-    for seed in range(320, 320 + draws(2, 12)):
+    for seed in range(320, 320 + draws(1, 12)):
         truth = random_truth(seed, 2.3, tempo=1.6)
         for arm in ARMS.values():
             estimator = ExtendedKalmanFilter()
@@ -626,27 +626,30 @@ def test_outliers_hardly_matter() -> None:
 
 
 def damaged(skeleton: Skeleton, field: str, value: float, rng: np.random.Generator) -> Skeleton:
-    some = rng.random(N_JOINTS) < 0.3
+    hit = rng.random(N_JOINTS) < 0.3
     if field == "covariances":
         covariances = np.tile(NOISE**2 * np.eye(3), (N_JOINTS, 1, 1))
-        covariances[some] *= value / NOISE**2
+        covariances[hit] *= value / NOISE**2
         return replace(skeleton, covariances=covariances)
     positions = skeleton.positions.copy()
-    positions[some, rng.integers(3)] = value
+    positions[hit, rng.integers(3)] = value
     return replace(skeleton, positions=positions)
 
 
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
 @pytest.mark.parametrize(
     ("field", "values"),
-    [
-        ("positions", (np.nan, 150.0, 1e300)),
-        ("positions", (-np.inf, -1e6)),
-        ("covariances", (np.nan, 0.0, 1e12)),
-        ("covariances", (-1e-3, np.inf, 1e-15)),
-        ("all positions", (np.nan,)),
-        ("all states", (TrackingState.NOT_TRACKED,)),
-    ],
+    some(
+        [
+            ("positions", (np.nan, 150.0, 1e300)),
+            ("positions", (-np.inf, -1e6)),
+            ("covariances", (np.nan, 0.0, 1e12)),
+            ("covariances", (-1e-3, np.inf, 1e-15)),
+            ("all positions", (np.nan,)),
+            ("all states", (TrackingState.NOT_TRACKED,)),
+        ],
+        3,
+    ),
 )
 def test_damaged_numbers_do_no_harm(field: str, values: tuple[float, ...]) -> None:
     """In every third frame, from the first one on; the frames between are enough."""
@@ -692,7 +695,7 @@ def test_of_a_person_who_stands_no_unobserved_angle_drifts_or_is_told() -> None:
     seed = 0
     rng = np.random.default_rng(seed)
     lengths = RandomPerson.draw(rng).lengths
-    times = capture_times(float(draws(5, 40)), rng, 30.0)
+    times = capture_times(float(draws(3, 40)), rng, 30.0)
     tangent = np.zeros(MODEL.nv)
     tangent[[MODEL.coordinate_names.index(f"elbow_flexion_{side}") for side in ("left", "right")]] = np.radians(25.0)
     tangent[6:12] = np.radians(rng.normal(scale=4.0, size=6))

@@ -365,7 +365,7 @@ def test_what_a_silent_source_said_no_more_is_bounded_by_the_ranges() -> None:
     assert np.radians(20.0) < deviation < 1.5 * Ranges(MODEL).stddev[elbow - 6]
 
 
-@pytest.mark.parametrize("turn", [(0.35, 0.0, 0.0), (0.0, 0.0, 0.35)])
+@pytest.mark.parametrize("turn", some([(0.0, 0.0, 0.35), (0.35, 0.0, 0.0)]))
 def test_a_sensor_that_slips_leaves_the_angles_sound(turn: tuple[float, float, float]) -> None:
     person = worn_person(4, 7.0, 0.01)
     source = Source("upper_arm_right", slip=(3.5, turn))
@@ -494,7 +494,13 @@ def out_to_the_side(elbow: float, twist: float) -> FloatArray:
     return q
 
 
-@pytest.mark.parametrize("after", [0.1, 3.0], ids=["from the start", "after seconds of the camera alone"])
+@pytest.mark.parametrize(
+    "after",
+    [
+        pytest.param(0.1, id="from the start"),
+        pytest.param(3.0, id="after seconds of the camera alone", marks=pytest.mark.slow),
+    ],
+)
 def test_an_upper_arm_is_turned_about_itself_as_its_sensor_says_however_a_camera_sees_it_bent(after: float) -> None:
     truth = out_to_the_side(elbow=5.0, twist=0.0)
     rotation = MODEL.forward(truth, MODEL.default_lengths()).rotations[SEGMENT_NUMBER["upper_arm_right"]]

@@ -21,6 +21,7 @@ from body_tracking.kinematics.posture import PosturePrior
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
 from body_tracking.kinematics.upper_body import SHOULDER_AXES, UpperBody
+from draws import draws
 
 MODEL = UpperBody()
 LENGTHS = MODEL.default_lengths()
@@ -200,7 +201,7 @@ REBUILT = {"model": assert_model, "isb": assert_isb, "rep155": assert_rep155, "d
 def test_the_angles_rebuild_the_rotations(name: str) -> None:
     """Of people anywhere, and in the singular poses of the shoulders."""
     singular = ((0, 0), (0, 90), (90, 0), (180, 0), (0, 180), (90, 90), (-40, 0))
-    for q in (*poses(100), *(arms(*pose, rotation=20.0, elbow=50.0) for pose in singular)):
+    for q in (*poses(draws(30, 100)), *(arms(*pose, rotation=20.0, elbow=50.0) for pose in singular)):
         angles = angles_of(estimate(q), MODEL, name)
         assert np.isfinite(angles.position).all()
         REBUILT[name](q, by_name(angles))
@@ -254,7 +255,7 @@ def _away_from_singular(name: str, count: int, stddev: float) -> list[FloatArray
 @pytest.mark.parametrize("name", CONVENTIONS)
 def test_rates_and_standard_deviations_are_those_of_differences(name: str) -> None:
     step = 1e-6
-    for q in _away_from_singular(name, 4, 1e-6):
+    for q in _away_from_singular(name, draws(2, 4), 1e-6):
         now = angles_of(estimate(q), MODEL, name)
         columns = []
         for direction in np.eye(NV):
@@ -391,12 +392,12 @@ def test_rates_of_held_angles_are_the_derivatives_of_the_held_angles(name: str) 
 
 @pytest.mark.parametrize("name", CONVENTIONS)
 def test_noise_does_not_spin_an_arm_at_a_singular_pose(name: str) -> None:
-    """Ten seconds of a person who keeps the pose, with the noise that the filter states."""
+    """Some seconds of a person who keeps the pose, with the noise that the filter states."""
     rng = np.random.default_rng(3)
     pose = arms(*SINGULAR[name])
     before: JointAngles | None = None
     seen = []
-    for _ in range(300):
+    for _ in range(draws(100, 300)):
         q = MODEL.integrate(pose, np.concatenate([np.zeros(6), rng.normal(0.0, 1.5 * DEGREE, NV - 6)]))
         before = angles_of(estimate(q, 1.5 * DEGREE), MODEL, name, before)
         seen.append(before.position)

@@ -113,7 +113,7 @@ def test_starts_that_are_somewhat_wrong_lead_to_the_same_fit() -> None:
 )
 def test_missing_points_keep_what_is_seen_right(missing: tuple[Joint, ...], unknown: tuple[str, ...]) -> None:
     """And of an angle that no seen point depends on, only what is known of it before is known."""
-    _, lengths, points = people(draws(6, 30), 4)
+    _, lengths, points = people(draws(3, 30), 4)
     gone = of(*missing)
     for length, point in zip(lengths, points, strict=True):
         fit = INVERSE.solve(np.where(gone[:, None], np.nan, point), EXACT, length, max_iterations=50)
@@ -129,6 +129,8 @@ def test_the_covariance_is_that_of_many_noisy_fits() -> None:
     """Of the fitted points, which the noise affects; the ranges of motion determine the rest."""
     rng = np.random.default_rng(5)
     _, lengths, points = people(1, 6)
+    count = draws(100, 300)
+    wider = np.sqrt(300 / count)
     for length, point in zip(lengths, points, strict=True):
         stddev = rng.uniform(0.005, 0.015, len(point))
         exact = INVERSE.solve(point, stddev, length)
@@ -138,13 +140,13 @@ def test_the_covariance_is_that_of_many_noisy_fits() -> None:
                     INVERSE.solve(point + stddev[:, None] * rng.normal(size=point.shape), stddev, length, exact.q).q,
                     length,
                 ).positions
-                for _ in range(300)
+                for _ in range(count)
             ]
         )
         jacobian = MODEL.linearise(exact.q, length).jacobian
         stated = np.sqrt(np.einsum("pij,jk,pik->pi", jacobian, exact.covariance, jacobian))
-        assert_allclose(fitted.std(axis=0) / stated, 1.0, atol=0.25)
-        assert_allclose((fitted.var(axis=0) / stated**2).mean(), 1.0, atol=0.1)
+        assert_allclose(fitted.std(axis=0) / stated, 1.0, atol=0.25 * wider)
+        assert_allclose((fitted.var(axis=0) / stated**2).mean(), 1.0, atol=0.1 * wider)
 
 
 def test_limits_push_back_softly() -> None:
@@ -167,7 +169,7 @@ def test_limits_push_back_softly() -> None:
 def test_the_pull_of_an_outlier_does_not_grow_with_its_distance() -> None:
     """Huber: a point 1 m off bends the pose no more than one 0.5 m off; most poses stay within the noise."""
     rng = np.random.default_rng(7)
-    _, lengths, points = people(draws(10, 40), 8)
+    _, lengths, points = people(draws(5, 40), 8)
     noise, count = 0.01, points.shape[1]
     stddev = np.full(count, noise)
     errors = []
@@ -233,7 +235,7 @@ def test_a_hand_turned_over_moves_the_thumb_alone() -> None:
 def test_a_bent_hand_is_found_in_the_likeliest_pose(noise: float) -> None:
     """Whether it is sought from the points alone or from the pose with the hand turned over."""
     rng = np.random.default_rng(12)
-    q, lengths, _ = people(draws(10, 20), 12)
+    q, lengths, _ = people(draws(5, 20), 12)
     right = 0
     stddev = np.full(len(MODEL.joints), noise)
     for number, (one, length) in enumerate(zip(with_bent_wrists(q, 12), lengths, strict=True)):

@@ -90,16 +90,19 @@ def wrong(corners: Corners, kind: str, view: int, camera: int, rng: np.random.Ge
 
 @pytest.mark.parametrize(
     "kind",
-    [
-        "turned",
-        "mirrored",
-        "a column off",
-        "of another pair",
-        "scattered",
-        "a little scattered",
-        "one corner wrong",
-        "swapped",
-    ],
+    some(
+        [
+            "turned",
+            "mirrored",
+            "a little scattered",
+            "scattered",
+            "one corner wrong",
+            "of another pair",
+            "swapped",
+            "a column off",
+        ],
+        4,
+    ),
 )
 def test_a_wrong_board_is_named_and_left_out(shared_data: Path, kind: str) -> None:
     folder = shared_data / "stereo_chessboard"

@@ -19,6 +19,7 @@ from body_tracking.core import so3
 from body_tracking.mesh import anatomy, body_model, decimation
 from body_tracking.mesh.body_model import JOINTS, BodyModel, ModelFileError, Pose
 from body_tracking.mesh.skinning import lever_arms, vertex_normals
+from draws import some
 
 
 @pytest.fixture(scope="module")
@@ -191,7 +192,7 @@ def smpl(arrays: dict[str, Any], joints: int) -> dict[str, Any]:
     }
 
 
-@pytest.mark.parametrize(("joints", "protocol"), [(24, 2), (52, 4), (55, 2)])
+@pytest.mark.parametrize(("joints", "protocol"), some([(24, 2), (52, 4), (55, 2)]))
 def test_smpl_files_load_from_npz_and_pickle_alike(
     joints: int, protocol: int, arrays: dict[str, Any], tmp_path: Path
 ) -> None:
