@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+import shutil
 import signal
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -94,12 +97,27 @@ def shared_data() -> Path:
     return folder
 
 
+def _made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """A bag ``wave`` that the first worker of xdist makes, in a folder of this name, and all others read."""
+    base = factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    folder, partial = shared / name, shared / f"{name}.partial"
+    with (shared / f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not folder.exists():
+            shutil.rmtree(partial, ignore_errors=True)
+            partial.mkdir()
+            make(partial / "wave")
+            partial.rename(folder)
+    return folder / "wave"
+
+
 @pytest.fixture(scope="session")
 def wave(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The first 7 s of ``bags/tpose_wave``: the T-pose and some of the wave, for laws that do not need all of it."""
     from excerpts import beginning
 
-    return beginning(ROOT / "bags" / "tpose_wave", tmp_path_factory.mktemp("excerpt") / "wave", 7.0)
+    return _made_once(tmp_path_factory, "excerpt", lambda bag: beginning(ROOT / "bags" / "tpose_wave", bag, 7.0))
 
 
 @pytest.fixture(scope="session")
@@ -107,9 +125,7 @@ def replayed_wave(tmp_path_factory: pytest.TempPathFactory, wave: Path) -> Path:
     """The bag that the offline graph makes of ``wave`` with its default settings."""
     from body_tracking.recording.replay import ReplaySettings, replay
 
-    folder = tmp_path_factory.mktemp("replayed") / "wave"
-    replay(wave, folder, ReplaySettings(()))
-    return folder
+    return _made_once(tmp_path_factory, "replayed", lambda bag: replay(wave, bag, ReplaySettings(())))
 
 
 @pytest.fixture(scope="session")
@@ -117,6 +133,5 @@ def extended_wave(tmp_path_factory: pytest.TempPathFactory, wave: Path) -> Path:
     """The same with the extended filter."""
     from body_tracking.recording.replay import ReplaySettings, replay
 
-    folder = tmp_path_factory.mktemp("extended") / "wave"
-    replay(wave, folder, ReplaySettings((), filter_name="ekf"))
-    return folder
+    settings = ReplaySettings((), filter_name="ekf")
+    return _made_once(tmp_path_factory, "extended", lambda bag: replay(wave, bag, settings))
