@@ -148,7 +148,7 @@ def test_angles_are_matched_by_name_and_passed_over_the_cut() -> None:
     assert named.errors.offset[0] == pytest.approx(0.01, abs=1e-4) and named.errors.covered[0] == 1.0
 
 
-@pytest.mark.parametrize("name", some(tuple(CONVENTIONS), 2))
+@pytest.mark.parametrize("name", some(tuple(CONVENTIONS)))
 def test_the_models_true_coordinates_give_the_true_angles_in_the_estimates_convention(name: str) -> None:
     model = UpperBody()
     stamps = truth().stamps_ns

@@ -26,6 +26,7 @@ from body_tracking.filters import (
 )
 from body_tracking.filters.linear import LINEAR_MODELS, FilterError
 from body_tracking.filters.prediction import PERIOD_NS, Prediction
+from draws import draws
 from walkers import TRACKED, performed
 
 
@@ -130,7 +131,7 @@ def test_it_starts_anew_as_a_fresh_one(name: str, cause: str) -> None:
     if cause == "reset":
         tested.reset()
         assert tested.counters == counted
-    for each in FRAMES[:45]:
+    for each in FRAMES[: draws(20, 45)]:
         moved = replace(each, stamp_ns=each.stamp_ns + later * NANOSECONDS, frame_id=frame_id)
         assert_alike(tested.update(moved), fresh.update(moved))
     expected = {key: int(key == cause) for key in ("backward_jumps", "frame_changes", "gaps")}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import cache
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -130,7 +131,7 @@ def test_disagreement_increases_the_covariance() -> None:
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=draws(3, 15))
+@settings(max_examples=draws(2, 15))
 def test_output_is_independent_of_small_changes_of_arrival(seed: int) -> None:
     rng = np.random.default_rng(seed)
     orderly = frames(4.0, 0.01, phase=0.004)
@@ -218,7 +219,7 @@ def test_output_continues_while_the_reference_is_silent() -> None:
 
 
 @pytest.mark.parametrize("sensor", ["kinect1", "kinect2"])
-@pytest.mark.parametrize("seconds", [0.3, 1.2, 3.0])
+@pytest.mark.parametrize("seconds", some([1.2, 0.3, 3.0]))
 def test_a_temporary_reversal_in_one_sensor_is_swapped_back(sensor: str, seconds: float) -> None:
     """Whichever is the trusted one: the other sensor sees no reversal."""
 
@@ -352,7 +353,7 @@ def test_the_shoulders_of_real_people_never_reverse(shared_data: Path, person: s
     made = Fusion(("kinect1", "kinect2"))
     made.set_pose(calibration.current_update().result.poses["kinect1"])
     fused = []
-    for each in CsvRecording(shared_data / "kinect_pairs" / f"{person}_90deg.csv.gz"):
+    for each in islice(CsvRecording(shared_data / "kinect_pairs" / f"{person}_90deg.csv.gz"), draws(2500, 10_000)):
         for update in calibration.push(each.sensor, each.skeletons[0], each.received_ns):
             for name, pose in update.result.poses.items():
                 made.set_clock(name, update.valid_from_ns, update.result.clocks[name])

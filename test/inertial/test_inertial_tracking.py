@@ -43,9 +43,8 @@ def lines(fed: Fed, since: float = 0.0, until: float = np.inf) -> set[str]:
 
 @pytest.fixture(scope="module")
 def wrists() -> Iterator[Fed]:
-    yield feed(
-        recorded("forearm_rolling", (sensor("forearm_left"), sensor("forearm_right")), seed=3), TrackingParameters()
-    )
+    imus = sensor("forearm_left"), sensor("forearm_right")
+    yield feed(recorded("forearm_rolling", imus, seed=3), TrackingParameters(rate=10.0))
 
 
 def test_orientations_of_two_forearms_with_a_camera_are_within_their_stated_deviation(wrists: Fed) -> None:
@@ -77,14 +76,14 @@ def test_orientations_have_the_cameras_clock_correct_rates_and_at_most_the_reque
 
 
 def test_the_skeleton_has_its_forearms_and_states_inferred_joints(wrists: Fed) -> None:
-    assert len(wrists.skeletons) > 200
+    assert len(wrists.skeletons) > 70
     skeleton = wrists.skeletons[-1]
     assert skeleton.frame_id == "world"
     assert skeleton.states[Joint.ELBOW_LEFT] == TrackingState.INFERRED
     assert skeleton.states[Joint.KNEE_LEFT] == TrackingState.NOT_TRACKED
     truth = wrists.recording.truths[0]
     inside = []
-    for each in wrists.skeletons[150::10]:
+    for each in wrists.skeletons[50::3]:
         instant = int(np.argmin(np.abs(truth.stamps_ns - each.stamp_ns)))
         for joint in (Joint.SPINE_SHOULDER, Joint.ELBOW_LEFT, Joint.WRIST_RIGHT):
             assert each.covariances is not None
@@ -309,7 +308,7 @@ def test_a_sensor_in_other_units_is_named_and_left_out() -> None:
         assert sample.acceleration is not None
         return replace(sample, acceleration=sample.acceleration / 9.81)
 
-    fed = feed(recorded("two_handed_wave", (sensor("forearm_left"),), seed=1), meddle=in_g)
+    fed = feed(recorded("two_handed_wave", (sensor("forearm_left"),), seed=1), meddle=in_g, seconds=8.0)
     assert any(line.startswith("forearm_left: the acceleration is in units of g") for line in lines(fed, 5.0))
     assert not [each for each in fed.orientations if each.stamp_ns - START_NS > 4 * NANOSECONDS]
 

@@ -19,6 +19,7 @@ from body_tracking.kinect import kinect_protocol, kinect_sender
 from body_tracking.kinect.live import SourceSettings
 from body_tracking.kinect.network import NetworkSource
 from body_tracking.recording.source import RecordingSource
+from draws import some
 
 BAG = Path(__file__).resolve().parents[2] / "bags" / "tpose_wave"
 COMMAND = [sys.executable, "-m", "body_tracking.kinect.kinect_sender"]
@@ -62,7 +63,7 @@ INSTALLED = [
 ]
 
 
-@pytest.mark.parametrize(("arguments", "reported"), [*ALONE, *INSTALLED])
+@pytest.mark.parametrize(("arguments", "reported"), [*ALONE, *some(INSTALLED)])
 def test_missing_or_invalid_input_is_reported_in_one_line(
     alone: list[str], arguments: list[str], reported: str
 ) -> None:

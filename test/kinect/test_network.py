@@ -188,7 +188,7 @@ def attacks(numbers: random.Random, partner: Partner, now: int) -> Iterator[tupl
 
 
 def test_of_many_bad_packets_none_is_accepted_and_the_good_stream_loses_nothing() -> None:
-    count = draws(20_000, 1_000_000)
+    count = draws(10_000, 1_000_000)
     receiver, partner, now = settled(3.0)
     numbers = random.Random(5)
     pool = [each for _ in range(count // 500) for each in attacks(numbers, partner, now)]

@@ -22,6 +22,7 @@ from body_tracking.kinematics.tracking import (
     segment_poses,
 )
 from body_tracking.kinematics.upper_body import UNOBSERVED, UpperBody
+from draws import draws
 
 MODEL = UpperBody()
 LENGTHS = MODEL.default_lengths(1.82) * (1.0 + 0.05 * np.sin(np.arange(21)))
@@ -86,7 +87,7 @@ def test_lengths_pose_and_rates_of_a_person_come_back() -> None:
 def test_the_stated_deviations_hold_what_noise_does_to_what_is_seen() -> None:
     rng = np.random.default_rng(4)
     errors = []
-    for estimate in followed(SkeletonFit(MODEL), np.arange(150) * FRAME, rng)[40:]:
+    for estimate in followed(SkeletonFit(MODEL), np.arange(draws(100, 150)) * FRAME, rng)[40:]:
         stddev = np.sqrt(estimate.covariance.diagonal()[: MODEL.nv])
         errors.append(MODEL.difference(estimate.q, motion(estimate.stamp_ns / NANOSECONDS)[0]) / stddev)
     observed = np.array([name not in UNOBSERVED for name in MODEL.coordinate_names])

@@ -306,8 +306,9 @@ def test_calibrate_prints_poses_and_clocks(wave: Path, tmp_path: Path, command: 
         assert sensor["residual_mm"] < 100.0
     assert "kinect2: at (" in command("calibrate", wave, "--method", "thesis")[1]
     # A saved calibration can be used from the first frame on.
+    brief = beginning(BAG, tmp_path / "brief", 2.0)
     code, out, error = command(
-        "replay", wave, "-o", tmp_path / "out", "--calibration", tmp_path / "robust.yaml", "--json"
+        "replay", brief, "-o", tmp_path / "out", "--calibration", tmp_path / "robust.yaml", "--json"
     )
     assert code == 0, error
     assert json.loads(out)["counters"].get("fusion uncalibrated", 0) == 0

@@ -16,7 +16,7 @@ from small_mappings import content, mapping, seen
 from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.robot.calibration import CalibrationQuality
 from body_tracking.robot.follower import Command, Follower, FollowerError, State
-from draws import draws
+from draws import draws, some
 
 PERIOD = 0.01
 PERIOD_NS = round(PERIOD * NANOSECONDS)
@@ -234,6 +234,8 @@ def test_every_fault_is_held_by_name_then_stopped_and_forgotten_when_it_ends(kin
     held = bench.run(within)
     assert held.state == State.HOLDING and reported in held.reason
     np.testing.assert_allclose(place(held), place(before), atol=2.0**2 / (2 * 20.0))
+    if kind not in some(list(FAULTS), 8):
+        return  # what follows is the same for all
     assert bench.run(0.9 - within).state == State.HOLDING
     stopped = bench.run(within + 0.2)
     assert (stopped.state, stopped.position) == (State.STOPPED, None)

@@ -65,7 +65,7 @@ def test_other_errors_leave_people_clocks_and_captures_as_they_are() -> None:
     assert [sensor.clock for sensor in one.sensors] == [sensor.clock for sensor in other.sensors]
 
 
-@settings(max_examples=draws(4, 8), deadline=None)
+@settings(max_examples=draws(2, 8), deadline=None)
 @given(seed=st.integers(0, 1000), number=st.sampled_from(NUMBERS))
 def test_without_errors_the_sensors_report_the_true_joints(seed: int, number: int) -> None:
     recording = simulate(Setup("two_handed_wave", layout(number), seconds=SHORT, seed=seed, errors=KinectErrors.none()))
