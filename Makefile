@@ -75,7 +75,7 @@ demo-mesh: $(STAMP) ## the same with depth images: from the mesh of a body to jo
 	@echo "recording: $(DEMO_MESH)/recording"
 
 # The tests that compute, and lint, take what is left of the processors by those that start processes and mostly wait; the
-# latter run several at a time, and one at a time where they state how soon something happens. All of it runs, whatever
+# latter run two at a time (more of them only wait for each other), and one at a time where they state how soon something happens. All of it runs, whatever
 # fails. The workspace for test/ros2 is made before, and does not count as time of the tests.
 test: $(STAMP) ## formatting, lint, types and the tests, in five minutes
 	@$(call tests,not slow)
@@ -89,7 +89,7 @@ failed=; $(MAKE) --no-print-directory ros2-workspace || { failed=", the workspac
 phase() { name="$$1"; shift; echo "== $$name"; $(BIN)/python -m pytest "$$@" || failed="$$failed, $$name"; }; \
 nice -n 19 $(MAKE) --no-print-directory lint >$(VENV)/lint.txt 2>&1 & lint=$$!; \
 nice -n 19 $(BIN)/python -m pytest -m "($(1)) and not processes" --numprocesses 2 --dist worksteal >$(VENV)/compute.txt 2>&1 & compute=$$!; \
-phase "tests of processes" -m "($(1)) and processes and not alone" --numprocesses 4 --dist loadscope --no-loadscope-reorder; \
+phase "tests of processes" -m "($(1)) and processes and not alone" --numprocesses 2 --dist loadscope --no-loadscope-reorder; \
 phase "tests of time" -m "($(1)) and processes and alone"; \
 echo "== tests that compute"; wait $$compute || failed="$$failed, tests that compute"; cat $(VENV)/compute.txt; \
 echo "== formatting, lint, types"; wait $$lint || failed="$$failed, formatting, lint, types"; cat $(VENV)/lint.txt; \
