@@ -74,10 +74,10 @@ demo-mesh: $(STAMP) ## the same with depth images: from the mesh of a body to jo
 	$(BIN)/body_tracking mesh show $(DEMO_MESH)/recording -o $(DEMO_MESH)/mesh.png
 	@echo "recording: $(DEMO_MESH)/recording"
 
-# The tests that compute, and lint, take what is left of the processors by those that start processes and mostly wait; the
-# latter run two at a time (more of them only wait for each other), and one at a time where they state how soon something happens. All of it runs, whatever
-# fails. The workspace for test/ros2 is made before, and does not count as time of the tests.
-test: $(STAMP) ## formatting, lint, types and the tests, in five minutes
+# The tests that compute, and lint, take what is left of the processors by those that start processes; of these two run at
+# a time, and one at a time where they state how soon something happens. All of it runs, whatever fails. The workspace for
+# test/ros2 is made before, and does not count as time of the tests.
+test: $(STAMP) ## formatting, lint, types and the tests, in seven minutes
 	@$(call tests,not slow)
 
 test-all: export TEST_DRAWS = all
