@@ -7,7 +7,8 @@ median over subjects of their clips' medians, and of these the ratio to the raw 
 frames whose error lies within 1.96 of the published standard deviation (linear filters: positional angles; ``ekf``:
 convention ``isb``), and deviation the median of these. The linear filters' deviations depend on the correlation of
 neighbouring joints' errors (``core.measurement``), which is fitted without that subject, too; ``ekf`` has the shipped
-one. Clips whose time warp explains less than 0.9 are left out.
+one. Rate is the RMS of the angle's error differentiated by time, degrees per second; ``--lag`` adds rows with smoothing
+(``filters.smoothing``). Clips whose time warp explains less than 0.9 are left out.
 
 Angles. Elevation: upper arm against the trunk axis, 0 hanging; flexion: forearm against upper arm, 0 straight. Kinect:
 the lines between the joints, trunk axis from SpineMid to SpineShoulder. Vicon: from joint centres that are computed
@@ -29,6 +30,7 @@ from __future__ import annotations
 import csv
 import gzip
 import sys
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
@@ -40,10 +42,12 @@ from scipy.optimize import brentq
 from time_warp import TimeWarp, compare, estimate_warp
 
 from body_tracking.calibration.arm_directions import ArmLaw, corrected_arms, fit_arm_law
+from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.measurement import joint_stddev
 from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from body_tracking.evaluation.metrics import sample
-from body_tracking.filters import DEFAULT_FILTER, ModelFilter, make_filter
+from body_tracking.filters import DEFAULT_FILTER, ModelFilter, SkeletonFilter, make_filter
+from body_tracking.filters.smoothing import FixedLag, SmoothableFilter
 from body_tracking.kinect.axes import camera_space_to_optical
 from body_tracking.kinematics.conventions import angles_of
 from body_tracking.kinematics.positional import positional_angles
@@ -65,13 +69,14 @@ _NAMES = ("shoulder_elevation_right", "elbow_flexion_right")
 _EVERY = 30
 """Every thirtieth frame fits the correlation: errors of frames that follow each other hardly differ."""
 RAW = "raw"
-METHODS: dict[str, tuple[str, bool]] = {
-    DEFAULT_FILTER: (DEFAULT_FILTER, True),
-    "ekf": ("ekf", True),
-    f"{DEFAULT_FILTER}, no law": (DEFAULT_FILTER, False),
-    "ekf, no law": ("ekf", False),
+Methods = dict[str, tuple[str, bool, float]]
+METHODS: Methods = {
+    DEFAULT_FILTER: (DEFAULT_FILTER, True, 0.0),
+    "ekf": ("ekf", True, 0.0),
+    f"{DEFAULT_FILTER}, no law": (DEFAULT_FILTER, False, 0.0),
+    "ekf, no law": ("ekf", False, 0.0),
 }
-"""Filters at their default settings, from each clip's first frame on, with and without the law."""
+"""Filters at their default settings, from each clip's first frame on, with and without the law, and the lag in s."""
 HELD = (DEFAULT_FILTER, "ekf")
 """Those that are held to the bars."""
 LEAST_EXPLAINED = 0.9
@@ -220,17 +225,35 @@ class Filtered:
     stddev: FloatArray
 
 
-def filtered(skeletons: list[Skeleton], name: str, of_bones: float) -> Filtered:
-    """Run a filter over skeletons; ``of_bones`` as of ``positional_angles``."""
-    chosen = make_filter(name)
-    found, angles = [], None
-    published, stddev = [], []
+def _outputs(
+    skeletons: list[Skeleton], chosen: SkeletonFilter, lag: float
+) -> Iterator[tuple[Skeleton, ModelEstimate | None]]:
+    """The output of a filter, smoothed with a lag in s unless that is 0."""
+    if lag:
+        assert isinstance(chosen, SmoothableFilter)
+        held = FixedLag(chosen, lag)
     for each in skeletons:
         if (out := chosen.update(each)) is None:
             continue
+        if lag:
+            assert isinstance(chosen, SmoothableFilter)
+            yield from map(chosen.results_of, held.take(chosen.last_frame(), each.stamp_ns))
+        else:
+            yield out, chosen.estimate if isinstance(chosen, ModelFilter) else None
+    if lag:
+        assert isinstance(chosen, SmoothableFilter)
+        yield from map(chosen.results_of, held.flush())
+
+
+def filtered(skeletons: list[Skeleton], name: str, of_bones: float, lag: float = 0.0) -> Filtered:
+    """Run a filter over skeletons; ``of_bones`` as of ``positional_angles``, the lag of smoothing in s."""
+    chosen = make_filter(name)
+    found, angles = [], None
+    published, stddev = [], []
+    for out, estimate in _outputs(skeletons, chosen, lag):
         if isinstance(chosen, ModelFilter):
-            assert chosen.estimate is not None
-            angles = angles_of(chosen.estimate, chosen.model, "isb", angles)
+            assert estimate is not None
+            angles = angles_of(estimate, chosen.model, "isb", angles)
         else:
             angles = positional_angles(out, of_bones)
         columns = [angles.names.index(name) for name in _NAMES]
@@ -345,14 +368,15 @@ def _positional(skeletons: list[Skeleton], of_bones: float) -> tuple[FloatArray,
     )  # type: ignore[return-value]
 
 
-def measure(job: tuple[Clip, ArmLaw, float]) -> dict[str, Any]:
+def measure(job: tuple[Clip, ArmLaw, float, Methods]) -> dict[str, Any]:
     """All figures of one clip: per method and angle the agreement and the coverage, and the lag."""
-    clip, law, of_bones = job
+    clip, law, of_bones, methods = job
     skeletons = clip.skeletons
     vicon = vicon_arm(clip.folder / f"{clip.name}_vicon.csv.gz")
     corrected = [corrected_arms(each, law) for each in skeletons]
     outputs = {
-        name: filtered(corrected if with_law else skeletons, own, of_bones) for name, (own, with_law) in METHODS.items()
+        name: filtered(corrected if with_law else skeletons, own, of_bones, lag)
+        for name, (own, with_law, lag) in methods.items()
     }
     arms = {RAW: kinect_arm(skeletons)} | {name: kinect_arm(each.skeletons) for name, each in outputs.items()}
     warp = align(list(arms.values()), vicon, clip.name)
@@ -363,6 +387,8 @@ def measure(job: tuple[Clip, ArmLaw, float]) -> dict[str, Any]:
         for column, angle in enumerate(ANGLES):
             true = sample(at, vicon.times, getattr(vicon, angle))
             figures[name][angle] = asdict(compare(getattr(arm, angle), true))
+            rates = np.gradient(getattr(arm, angle) - true, arm.times)
+            figures[name][angle]["rate_rms"] = float(np.sqrt(np.nanmean(rates**2)))
             if name in outputs:
                 stddev = outputs[name].stddev[:, column]
                 known = np.isfinite(true)
@@ -378,6 +404,9 @@ def main() -> int:
     """The benchmark; exit code 1 where a figure misses its bar."""
     parser = common.parser(__doc__, jobs=True, data=True)
     parser.add_argument("--fit", action="store_true", help="print the law of all subjects, and end")
+    parser.add_argument(
+        "--lag", type=float, nargs="+", default=[], metavar="S", help="also smooth with each of these lags (fixed-lag)"
+    )
     args = parser.parse_args()
     folder = args.data / "kinect_vs_vicon"
     files = common.recordings(folder, sorted(file.name for file in folder.glob("*_kinect.csv.gz")))
@@ -393,8 +422,10 @@ def main() -> int:
     others = {subject: [each for each in clips if each.subject != subject] for subject in subjects}
     laws = {subject: law_of(each) for subject, each in others.items()}
     correlations = {subject: correlation_of(each) for subject, each in others.items()}
-    rows = common.mapped(measure, [(each, laws[each.subject], correlations[each.subject]) for each in clips], args.jobs)
-    table = {name: {angle: _summary(rows, subjects, name, angle) for angle in ANGLES} for name in (RAW, *METHODS)}
+    methods = METHODS | {f"{name}, lag {lag:g}": (name, True, lag) for name in HELD for lag in args.lag}
+    jobs = [(each, laws[each.subject], correlations[each.subject], methods) for each in clips]
+    rows = common.mapped(measure, jobs, args.jobs)
+    table = {name: {angle: _summary(rows, subjects, name, angle) for angle in ANGLES} for name in (RAW, *methods)}
     figures = {"clips": rows, "table": table, "correlations": correlations}
     common.report(args, figures, lambda: show(table, len(clips), len(files), correlations))
     return common.verdicts(args, _bars(table))
@@ -408,7 +439,8 @@ def _summary(rows: list[dict[str, Any]], subjects: list[str], name: str, angle: 
 
     own, raw = by_subject("rms"), by_subject("rms", RAW)
     return {
-        key: median(by_subject(key)) for key in ("rms", "debiased_rms", "bias", *(("stddev",) if name != RAW else ()))
+        key: median(by_subject(key))
+        for key in ("rms", "debiased_rms", "bias", "rate_rms", *(("stddev",) if name != RAW else ()))
     } | {
         "of_raw": median(own) / median(raw),
         "worst": max(one - other for one, other in zip(own, raw, strict=True)),
@@ -433,8 +465,10 @@ def show(table: dict[str, dict[str, dict[str, Any]]], used: int, of: int, correl
     """The table."""
     print(f"{used} of {of} clips, {len(correlations)} subjects; degrees")
     print("correlation of a bone's joints without each: " + " ".join(f"{each:.3f}" for each in correlations.values()))
-    columns = f"{'RMS':>5} {'of raw':>6} {'debiased':>8} {'bias':>5} {'worst':>5} {'stddev':>6} {'coverage':>8}"
-    print(f"{'':<34}{'elevation':^49}   {'elbow flexion':^49}")
+    columns = (
+        f"{'RMS':>5} {'of raw':>6} {'debiased':>8} {'bias':>5} {'rate':>5} {'worst':>5} {'stddev':>6} {'coverage':>8}"
+    )
+    print(f"{'':<34}{'elevation':^55}   {'elbow flexion':^55}")
     print(f"{'':<34}{columns}   {columns}")
     for name, angles in table.items():
         print(f"{name:<34}" + "   ".join(_line(angles[angle]) for angle in ANGLES))
@@ -447,6 +481,7 @@ def show(table: dict[str, dict[str, dict[str, Any]]], used: int, of: int, correl
 
 def _line(own: dict[str, Any]) -> str:
     accuracy = f"{own['rms']:>5.1f} {own['of_raw']:>6.3f} {own['debiased_rms']:>8.2f} {own['bias']:>5.1f}"
+    accuracy += f" {own['rate_rms']:>5.1f}"
     return f"{accuracy} {own['worst']:>5.1f} {own.get('stddev', float('nan')):>6.1f} {own['coverage']:>8.3f}"
 
 

@@ -20,7 +20,7 @@ Li and Kirubarajan 2001, section 11.2).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -39,6 +39,7 @@ from body_tracking.core.skeleton import (
     TrackingState,
 )
 from body_tracking.filters.arrival import Arrival, Arrivals
+from body_tracking.filters.smoothing import backward_gain, smoothed_covariance
 from body_tracking.filters.stacked import StackedKalmanFilter
 from body_tracking.kinematics.motion import ACCELERATION_DENSITIES, joint_densities
 
@@ -74,6 +75,46 @@ def _towards_trunk() -> IntArray:
 
 
 _TOWARDS_TRUNK = _towards_trunk()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Frame:
+    """The estimate after one frame, for smoothing; n is 3 or 6.
+
+    Attributes:
+        skeleton: as published.
+        state: (25, n, 1) of each joint.
+        covariance: (25, n, n) of these, without the slow error.
+        slow: (25, 3, 3) covariance of the slow error.
+        alive: (25,) joints with an estimate.
+        continued: (25,) those that were not started by this frame.
+        transition: (25, n, n) from the frame before.
+        prior: (25, n, 1) predicted state.
+        prior_covariance: (25, n, n) of these, with the process noise that was used in the end.
+    """
+
+    skeleton: Skeleton
+    state: FloatArray
+    covariance: FloatArray
+    slow: FloatArray
+    alive: BoolArray
+    continued: BoolArray
+    transition: FloatArray
+    prior: FloatArray
+    prior_covariance: FloatArray
+
+    @property
+    def stamp_ns(self) -> int:
+        return self.skeleton.stamp_ns
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Link:
+    """Backward gains (25, n, n) and the predictions (25, n, 1) and (25, n, n) of the next frame."""
+
+    gain: FloatArray
+    prior: FloatArray
+    prior_covariance: FloatArray
 
 
 class FilterError(BodyTrackingError):
@@ -260,6 +301,10 @@ class LinearKalmanFilter:
         self._level: FloatArray = np.zeros(N_JOINTS)
         self._unmeasured: FloatArray = np.zeros(N_JOINTS)
         self._rejected: FloatArray = np.zeros(N_JOINTS)
+        self._started: BoolArray = np.zeros(N_JOINTS, dtype=bool)
+        self._transition: FloatArray = np.eye(size)
+        self._prior_covariance: FloatArray = np.zeros((N_JOINTS, size, size))
+        self._published: Skeleton | None = None
         self.innovation_distances: FloatArray = np.full(N_JOINTS, np.nan)
 
     def update(self, skeleton: Skeleton) -> Skeleton | None:
@@ -294,6 +339,7 @@ class LinearKalmanFilter:
         if started.any():
             self._start(started, positions, noise)
             self.counters["reacquired"] += int((started & rejected).sum())
+        self._started = started
         used = measured & (~rejected | started)
         slow = (1.0 - self.parameters.white_noise_share) * noise
         self._slow = np.where(used[:, None, None], slow, self._slow)
@@ -346,6 +392,7 @@ class LinearKalmanFilter:
             if self._order == 2:
                 transition[:3, 3:] = step * _EYE3
             kalman.predict(F=transition, Q=scale * noise_of_step)
+            self._transition = transition
 
         observation = np.zeros((N_JOINTS, 3, size))  # eq. 5.11, 5.12; zero where nothing is observed (eq. 5.21)
         observation[:, :, :3] = observed[:, None, None] * _EYE3
@@ -356,6 +403,7 @@ class LinearKalmanFilter:
         self.innovation_distances = np.where(observed, distances, np.nan)
         suspects: BoolArray = np.array(distances > self._gate)
         surprise = np.clip(distances / 3.0 - _SURPRISING, 0.0, _MOST_SURPRISING - _SURPRISING)
+        self._prior_covariance = np.asarray(kalman.P_prior)
         level = self._level
         self._level = np.minimum(level + self.parameters.adaptation * surprise, _MOST_LEVEL)
         if not suspects.any():
@@ -368,11 +416,13 @@ class LinearKalmanFilter:
         kalman.x, kalman.P = kalman.x_prior, kalman.P_prior
         raised = np.where(suspects[:, None, None], np.exp(self._level)[:, None, None] - scale, 0.0) * noise_of_step
         kalman.P = kalman.P_prior + raised
+        prior_covariance = kalman.P
         noise = np.where(suspects[:, None, None], noise, white)
         kalman.update(measurement, R=noise, H=observation)
         rejected: BoolArray = suspects & (self._distances() > self._gate)
         kalman.x[rejected] = kalman.x_prior[rejected]
         kalman.P[rejected] = kalman.P_prior[rejected]
+        self._prior_covariance = np.where(rejected[:, None, None], kalman.P_prior, prior_covariance)
         self._level[rejected] = level[rejected]  # an outlier does not raise the noise
         self._carry(carrier, ~observed | rejected)
         return rejected
@@ -418,6 +468,7 @@ class LinearKalmanFilter:
         density = self._unit_noise[:, 3, 3]
         noise = np.where(free[:, None, None], density[:, None, None] * np.kron(blocks, _EYE3), noise)
         self._kalman.predict(F=transition, Q=noise, control=control @ carrying)
+        self._transition = transition
 
     def _carry(self, carrier: IntArray, unseen: BoolArray) -> None:
         """Apply the corrections of the carriers to their unseen joints (25,)."""
@@ -469,7 +520,7 @@ class LinearKalmanFilter:
             positions[~alive] = velocities[~alive] = np.nan
             covariances[~alive] = np.diag([np.inf] * 3)
             states[~alive] = TrackingState.NOT_TRACKED
-        return Skeleton(
+        self._published = Skeleton(
             skeleton.stamp_ns,
             skeleton.frame_id,
             positions,
@@ -478,3 +529,47 @@ class LinearKalmanFilter:
             covariances,
             velocities,
         )
+        return self._published
+
+    # --- smoothing (filters.smoothing)
+
+    def last_frame(self) -> _Frame:
+        """The estimate after the last frame that gave one."""
+        assert self._published is not None
+        kalman = self._kalman
+        return _Frame(
+            self._published,
+            np.array(kalman.x),
+            np.array(kalman.P),
+            self._slow,
+            self._alive,
+            self._alive & ~self._started,
+            np.broadcast_to(self._transition, kalman.P.shape),
+            np.array(kalman.x_prior),
+            np.array(self._prior_covariance),
+        )
+
+    def link(self, before: _Frame, after: _Frame) -> _Link:
+        """Backward gains; zero for joints that were started or lost in between."""
+        gain = backward_gain(after.transition @ before.covariance, after.prior_covariance)
+        gain *= (before.alive & after.continued)[:, None, None]
+        return _Link(gain, after.prior, after.prior_covariance)
+
+    def smoothed(self, frame: _Frame, link: _Link, later: _Frame) -> _Frame:
+        """Equation 1 of :mod:`body_tracking.filters.smoothing`, for every joint."""
+        state = frame.state + link.gain @ (later.state - link.prior)
+        covariance = smoothed_covariance(frame.covariance, link.gain, later.covariance, link.prior_covariance)
+        return replace(frame, state=state, covariance=covariance)
+
+    def results_of(self, frame: _Frame) -> tuple[Skeleton, None]:
+        """The published skeleton with the smoothed estimates."""
+        alive = frame.alive[:, None]
+        covariances = frame.covariance[:, :3, :3] + frame.slow
+        skeleton = replace(
+            frame.skeleton,
+            positions=np.where(alive, frame.state[:, :3, 0], np.nan),
+            covariances=np.where(alive[:, :, None], covariances, np.diag([np.inf] * 3)),
+        )
+        if self._order == 2:
+            skeleton = replace(skeleton, velocities=np.where(alive, frame.state[:, 3:, 0], np.nan))
+        return skeleton, None

@@ -125,6 +125,9 @@ class PeopleFilter:
         """Take the frames that have waited long enough, and publish the predicted ones that are due."""
         for person in self._persons:
             person.poll(now_ns)
+        newest_ns = max(person.newest_ns for person in self._persons)
+        for person in self._persons:  # one who is not seen now must not come after the others
+            person.passed(newest_ns)
         self._flush()
 
     def settle(self) -> None:
@@ -147,6 +150,7 @@ class PeopleFilter:
         self._last_ns.clear()
         for person in self._persons:
             person.reset()
+        self._flush()
 
     def _gone(self, number: int) -> None:
         self._last_ns.pop(number, None)
@@ -154,6 +158,12 @@ class PeopleFilter:
 
     def _filtered_one(self, skeleton: Skeleton) -> None:
         self._filtered.append(skeleton)
+
+    def flush(self) -> None:
+        """Publish all that is held back."""
+        for person in self._persons:
+            person.flush()
+        self._flush()
 
     def _flush(self) -> None:
         """Publish the skeletons of one time together."""

@@ -1,4 +1,4 @@
-"""The filter of one person: sensors' frames in their order, predicted frames in a silence, segment lengths."""
+"""The filter of one person: sensors' frames in their order, predicted frames in a silence, smoothing, lengths."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from body_tracking.filters import (
     make_filter,
 )
 from body_tracking.filters.prediction import Prediction
+from body_tracking.filters.smoothing import FixedLag, SmoothableFilter
 from body_tracking.fusion.alignment import SensorAlignment
 from body_tracking.fusion.ordering import Ordering
 from body_tracking.fusion.people import People
@@ -60,6 +61,7 @@ class FilterSettings:
         predict_after: seconds without a frame after which predicted ones are published.
         order_wait: greatest time in seconds that a sensor's frame waits for an older one.
         people: selection of people.
+        lag: seconds by which frames are held back to be smoothed; 0 for none.
         kinect_arms: whether the skeletons are of a Kinect v2, whose arms err in their directions by a known law; the
             thesis's filters do not use it.
     """
@@ -75,6 +77,7 @@ class FilterSettings:
     order_wait: float = DEFAULT_ORDER_WAIT
     people: PeopleParameters = field(default_factory=PeopleParameters)
     kinect_arms: bool = True
+    lag: float = 0.0
 
 
 class PersonFilter:
@@ -94,7 +97,7 @@ class PersonFilter:
 
     Raises:
         FilterError: unknown filter, or invalid parameters.
-        GraphError: the filter does not take this input.
+        GraphError: the filter does not take this input, or no lag.
         FusionError: the reference is not among the sensors.
     """
 
@@ -118,6 +121,11 @@ class PersonFilter:
         self._ordering = Ordering(settings.sensors, settings.order_wait)
         self._model_filter = self._filter if isinstance(self._filter, ModelFilter) else None
         self.models = self._model_filter is not None
+        self._lag: FixedLag | None = None
+        if settings.lag:
+            if not isinstance(self._filter, SmoothableFilter):
+                raise graph.GraphError(f"filter {settings.filter_name} cannot smooth (lag, --smooth)")
+            self._lag = FixedLag(self._filter, settings.lag)
         self._prediction = Prediction(settings.predict_after)
         self._lengths = LengthChanges()
         self._topics = graph.model_topics(settings.body, one_of_several is not None)
@@ -194,7 +202,11 @@ class PersonFilter:
         self._present = True
         if self._model_filter is not None:
             self._take([("", skeleton)], now_ns)
-        elif (filtered := self._filter.update(skeleton)) is not None:
+        elif (filtered := self._filter.update(skeleton)) is None:
+            return
+        elif self._lag is not None:
+            self._hold_back(self._lag, now_ns)
+        else:
             self._skeleton(filtered)
 
     def hold(self, sensor: str, skeletons: Sequence[Skeleton], now_ns: int) -> None:
@@ -234,11 +246,17 @@ class PersonFilter:
         if self._model_filter is None:
             return
         self.poll(now_ns)
-        if self._model_filter.take_orientation(measurement) and self._prediction.due_ns is None:
+        taken = self._model_filter.take_orientation(measurement)
+        if taken and not self.newest_ns and self._prediction.due_ns is None:
             self._prediction.arrived(measurement.stamp_ns, now_ns)
 
     def poll(self, now_ns: int) -> None:
         """Take the frames that have waited long enough, and publish the predicted ones that are due."""
+        self._poll_filter(now_ns)
+        if self._lag is not None and self._lag.due_ns is not None and self._lag.due_ns <= now_ns:
+            self.flush()
+
+    def _poll_filter(self, now_ns: int) -> None:
         if self._model_filter is None:
             return
         # each at its own deadline: predictions must not depend on the times of the calls
@@ -263,15 +281,46 @@ class PersonFilter:
     @property
     def deadline_ns(self) -> int | None:
         """Time of the next :meth:`poll` for a waiting frame, in the clock of ``now_ns``; None without one."""
-        return self._ordering.deadline_ns
+        deadlines = self._ordering.deadline_ns, None if self._lag is None else self._lag.due_ns
+        return min((each for each in deadlines if each is not None), default=None)
 
     @property
     def due_ns(self) -> int | None:
         """Time of the next :meth:`poll` for a predicted frame; None if a frame waits, or without prediction."""
         return self._prediction.due_ns if self.deadline_ns is None else None
 
+    @property
+    def newest_ns(self) -> int:
+        """Stamp of the newest frame that is held back; 0 without one."""
+        return 0 if self._lag is None else self._lag.newest_ns
+
+    def passed(self, newest_ns: int) -> None:
+        """Publish what a frame of this stamp, of anyone, is later than by the lag."""
+        if self._lag is not None:
+            self._release(self._lag.passed(newest_ns))
+
+    def flush(self) -> None:
+        """Publish all that is held back."""
+        if self._lag is not None:
+            self._release(self._lag.flush())
+
+    def _hold_back(self, lag: FixedLag, now_ns: int) -> None:
+        """Hold the last frame back, and publish those before it that have been for long enough."""
+        assert isinstance(self._filter, SmoothableFilter)
+        self._release(lag.take(self._filter.last_frame(), now_ns))
+
+    def _release(self, frames: Sequence[Any]) -> None:
+        for frame in frames:
+            assert isinstance(self._filter, SmoothableFilter)
+            skeleton, estimate = self._filter.results_of(frame)
+            if estimate is None:
+                self._skeleton(skeleton)
+            else:
+                self._send(skeleton, estimate)
+
     def reset(self) -> None:
-        """Forget the person, after a jump of time; poses and clocks stay."""
+        """Publish what is held back, and forget the person, after a jump of time; poses and clocks stay."""
+        self.flush()
         self._filter.reset()
         self._ordering.flush()
         self._prediction.stop()
@@ -292,8 +341,12 @@ class PersonFilter:
                 continue
             estimate = self._model_filter.estimate
             assert estimate is not None  # a frame was taken
-            self._prediction.arrived(skeleton.stamp_ns, now_ns)
-            self._send(None, estimate)
+            if self._lag is not None:
+                self._prediction.stop()
+                self._hold_back(self._lag, now_ns)
+            else:
+                self._prediction.arrived(skeleton.stamp_ns, now_ns)
+                self._send(None, estimate)
             if self._lengths.due(estimate.stamp_ns, estimate.lengths):
                 from body_tracking.kinematics.urdf import urdf
 

@@ -18,6 +18,7 @@ from body_tracking.filters import (
 )
 from body_tracking.filters.people import PeopleFilter, filter_of
 from body_tracking.filters.person import DEFAULT_ORDER_WAIT, DEFAULT_PREDICT_AFTER, FilterSettings, PersonFilter
+from body_tracking.filters.smoothing import MAX_LAG
 from body_tracking.fusion.stage import calibration_inputs
 from body_tracking.messages.codecs import (
     Ids,
@@ -63,6 +64,16 @@ ORDER_WAIT = Parameter(
     unit="s",
     min=0.0,
     max=1.0,
+    live=True,
+)
+LAG = Parameter(
+    "lag",
+    0.0,
+    "fixed-lag smoothing: publish each frame this much later, corrected by the frames after it; for recording and "
+    "looking, not for control. Not with the thesis's filters; no predicted frames (predict_after) unless 0",
+    unit="s",
+    min=0.0,
+    max=MAX_LAG,
     live=True,
 )
 KINECT_ARMS = Parameter(
@@ -131,6 +142,7 @@ class FilterStage(Stage):
         BODY,
         ORDER_WAIT,
         PREDICT_AFTER,
+        LAG,
         ORIENTATIONS,
         KINECT_ARMS,
         *PEOPLE,
@@ -162,6 +174,7 @@ class FilterStage(Stage):
             given["order_wait"],
             people_from(values),
             given["kinect_arms"],
+            given["lag"],
         )
         return filter_of(settings, self._publish, self.wanted)
 
@@ -184,11 +197,14 @@ class FilterStage(Stage):
         )
 
     def change(self, values: Mapping[str, Value]) -> None:
-        """Start a new filter at the next frame."""
+        """Start a new filter at the next frame; frames that the present one holds back are published."""
         made = self._make(values)
+        self.filter.flush()
         made.inherit(self.filter)
         self.filter, self.values = made, values
         self._connect(values)
+        there = {port.topic for port in self.outputs}
+        self._published = [output for output in self._published if output.topic in there]
 
     def _publish(self, topic: str, payload: Any, stamp_ns: int) -> None:
         self._published.append(Output(topic, payload, stamp_ns))

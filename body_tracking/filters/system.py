@@ -37,7 +37,7 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
     defaults: dict[str, Value] = {"orientations": segments} if segments else {}
     if options["sensors"] and options["sensors"] == options["computed"]:
         defaults["kinect_arms"] = False  # joints of a fitted mesh, and no Kinect's
-    chosen = asked(options, filter="filter", input="filter_input", subject="subject", people="people")
+    chosen = asked(options, filter="filter", input="filter_input", subject="subject", people="people", lag="lag")
     yield NodeSpec(
         "skeleton_filter",
         "skeleton_filter",
@@ -58,6 +58,14 @@ SYSTEM = System(
             "the filter; overrides the parameters file",
             choices=_filters,
             parameter=("skeleton_filter", "filter"),
+        ),
+        Option(
+            "lag",
+            0.0,
+            "seconds (at most 0.3) by which the filter's output comes later, smoothed by the frames after it: for "
+            "recording and looking, not for control",
+            metavar="S",
+            parameter=("skeleton_filter", "lag"),
         ),
         Option("filter_input", "", parameter=("skeleton_filter", "input"), hidden=True),
     ),

@@ -22,6 +22,7 @@ from body_tracking.core.message_types import POINT_CLOUD
 from body_tracking.core.parameters import Value, check_all
 from body_tracking.core.skeleton import NANOSECONDS, Skeleton
 from body_tracking.filters import DEFAULT_FILTER
+from body_tracking.filters.smoothing import WHOLE_LAG
 from body_tracking.messages.codecs import Skeletons
 from body_tracking.node_parameters import parameters_for
 from body_tracking.pipeline import graph
@@ -68,6 +69,7 @@ class ReplaySettings:
         more: further options of the graph, by name.
         parameters: further parameters by node; they override all of the above.
         model_covariance: also write the covariance of the filter's model.
+        smooth: smooth the whole recording, with more lag than a live graph may have.
     """
 
     sensors: tuple[str, ...] = ()
@@ -79,6 +81,7 @@ class ReplaySettings:
     more: Mapping[str, Value] = field(default_factory=dict)
     parameters: Mapping[str, Mapping[str, Value]] = field(default_factory=dict)
     model_covariance: bool = False
+    smooth: bool = False
 
     def options(self) -> Options:
         """Options of the graph."""
@@ -107,6 +110,8 @@ class ReplaySettings:
             known = {item.name for item in table}
             checked = check_all(table, {key: value for key, value in given.items() if key in known})
             found[name] = {**own, **checked}
+        if self.smooth and "skeleton_filter" in found:
+            found["skeleton_filter"]["lag"] = WHOLE_LAG
         return found
 
 
@@ -290,7 +295,17 @@ def settings_from(args: argparse.Namespace) -> ReplaySettings:
     sensors: tuple[str, ...] = ()
     if args.sensors:
         sensors = tuple(each for each in options["sensors"] if each not in options["computed"]) or (graph.NO_SENSORS,)
-    more = ("filter_input", "angles_input", "marker_setup", "marker_points", "depth", "person", "subject", "people")
+    more = (
+        "filter_input",
+        "angles_input",
+        "marker_setup",
+        "marker_points",
+        "depth",
+        "person",
+        "subject",
+        "people",
+        "lag",
+    )
     return ReplaySettings(
         sensors,
         args.reference or "",
@@ -301,6 +316,7 @@ def settings_from(args: argparse.Namespace) -> ReplaySettings:
         {name: options[name] for name in more},
         parameters,
         args.model_covariance,
+        args.smooth,
     )
 
 
@@ -322,7 +338,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     command.add_argument(
         "--body", default=graph.DEFAULT_BODY, help="id of the person, if only one is tracked (default: %(default)s)"
     )
-    names = ("sensors", "filter", "convention", "calibration", "imus", "subject", "people", "params_file")
+    names = ("sensors", "filter", "convention", "calibration", "imus", "subject", "people", "lag", "params_file")
     cameras = ("marker_setup", "marker_points", "depth", "person")
     add_options(
         command,
@@ -335,6 +351,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "bag)",
         calibration="start from this calibration (YAML)",
         model_covariance="with ekf: also write /filtered/model_covariance, which is most of such a bag",
+    )
+    command.add_argument(
+        "--smooth",
+        action="store_true",
+        help="correct each frame by all that come after it, as by --lag with a lag of seconds",
     )
     command.add_argument("--overwrite", action="store_true", help="replace an existing OUT")
     command.add_argument("--json", action="store_true", help="print the report as JSON")

@@ -24,6 +24,7 @@ from body_tracking.filters.ekf.poses import PoseSearch
 from body_tracking.filters.ekf.priors import Priors
 from body_tracking.filters.ekf.sensor_errors import SensorErrors
 from body_tracking.filters.ekf.skeletons import SkeletonUpdate
+from body_tracking.filters.ekf.smoothing import Frame, Link, Smoother
 from body_tracking.filters.ekf.sources import pose_of
 from body_tracking.filters.ekf.state import Measurement, SensorState, State, StateSpace
 from body_tracking.kinematics.lengths import SegmentLengths
@@ -40,6 +41,8 @@ _LONGEST_WAIT_NS = NANOSECONDS // 10
 """Greatest time that an orientation is queued without a request for the estimate."""
 _DISORDER_NS = NANOSECONDS // 300
 """Orientations of times so close to each other may come in any order."""
+_BREAKS = ("restarts", "branches", "slips", "broken_covariances", "frame_changes", "gaps")
+"""Counters of events after which a pose is not the continuation of the one before."""
 _UNPLACED_STDDEV, _UNTURNED_STDDEV = 100.0, 1.0
 """Metres and radians: of the base where orientations alone start the body."""
 
@@ -102,6 +105,7 @@ class ExtendedKalmanFilter:
         )
         self._facing = Facing(space, self.counters)
         self._output = Output(space, self._displacement, p)
+        self._smoother = Smoother(space, self._motion)
         self.reset()
 
     # --- what users call
@@ -272,6 +276,29 @@ class ExtendedKalmanFilter:
         state = self._priors.within(self._motion.predicted(state, stamp_ns))
         estimate = self._output.estimate(state, self._frame_id, self._body())
         return self._output.skeleton(state, self._empty(stamp_ns)), estimate
+
+    # --- smoothing (filters.smoothing)
+
+    def last_frame(self) -> Frame:
+        """The estimate after the last frame in its order."""
+        state = self._state
+        assert state is not None
+        skeleton = self._newest or self._empty(state.stamp_ns)
+        return Frame(state, skeleton, sum(self.counters[name] for name in _BREAKS), self._smoother.split(state))
+
+    def link(self, before: Frame, after: Frame) -> Link | None:
+        """As of :class:`Smoother`."""
+        return self._smoother.link(before, after)
+
+    def smoothed(self, frame: Frame, link: Link, later: Frame) -> Frame:
+        """As of :class:`Smoother`."""
+        return self._smoother.smoothed(frame, link, later)
+
+    def results_of(self, frame: Frame) -> tuple[Skeleton, ModelEstimate]:
+        """As :attr:`filtered` and :attr:`estimate`."""
+        state, skeleton = self._smoother.state_of(frame), frame.skeleton
+        estimate = self._output.estimate(state, skeleton.frame_id, skeleton.body)
+        return self._output.skeleton(state, skeleton), estimate
 
     # --- input
 

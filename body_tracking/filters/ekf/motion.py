@@ -59,8 +59,7 @@ class Motion:
         if dt <= 0.0:
             return state
         tau = self._parameters.velocity_time
-        fade = math.exp(-dt / tau)
-        reach = tau * (1.0 - fade)
+        fade, reach = self._faded(dt)
         density = np.exp(state.log_density)[self._group]
         if state.sources.names:
             speeds = (self._group_sum @ (state.velocity * state.velocity))[self._group]
@@ -68,14 +67,11 @@ class Motion:
         step = reach * state.velocity
         q = self._model.integrate(state.q, step)
 
-        turns = so3.quat_to_matrix(so3.exp(-step[self._model.ball_v]))
-        t, v = space.tangent, space.velocities
+        turns = self._turns(step)
         p = state.covariance.copy()
         crosses = math.exp(-dt / self._slow_time(state)) * state.crosses
         for part in (p, p.T, crosses):  # F P, then (F P) F^T, as rows and columns; and F C
-            self._turned_back(part, turns)
-            part[t] += reach * part[v]
-            part[v] *= fade
+            self._carried(part, turns, reach, fade)
         sources = state.sources
         if sources.names:
             share = advance(p, space.size, sources, dt, self._parameters)
@@ -102,6 +98,27 @@ class Motion:
             sources=sources,
             doubt=math.exp(-dt / _DOUBT_TIME) * state.doubt if state.doubt else 0.0,
         )
+
+    def carry(self, part: FloatArray, state: State, stamp_ns: int) -> None:
+        """Multiply rows (85, n) by the transition of :meth:`predicted` from the left, in place."""
+        dt = (stamp_ns - state.stamp_ns) / NANOSECONDS
+        fade, reach = self._faded(dt)
+        self._carried(part, self._turns(reach * state.velocity), reach, fade)
+
+    def _faded(self, dt: float) -> tuple[float, float]:
+        """Share of a velocity after a time, and by how many seconds of it the position moves."""
+        fade = math.exp(-dt / self._parameters.velocity_time)
+        return fade, self._parameters.velocity_time * (1.0 - fade)
+
+    def _turns(self, step: FloatArray) -> FloatArray:
+        """(3, 3, 3) rotations of the free rotations' tangents by a step (32,)."""
+        return so3.quat_to_matrix(so3.exp(-step[self._model.ball_v]))
+
+    def _carried(self, part: FloatArray | SingleArray, turns: FloatArray, reach: float, fade: float) -> None:
+        space = self._space
+        self._turned_back(part, turns)
+        part[space.tangent] += reach * part[space.velocities]
+        part[space.velocities] *= fade
 
     def _slow_time(self, state: State) -> float:
         """Seconds for which slow errors of cameras persist."""
