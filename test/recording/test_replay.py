@@ -25,6 +25,7 @@ from body_tracking.core.message_types import JOINT_STATE, POINT_CLOUD, TIME_REFE
 from body_tracking.core.parameters import ParameterError
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, TrackingState
 from body_tracking.filters import DEFAULT_FILTER
+from body_tracking.filters.smoothing import MAX_LAG
 from body_tracking.kinect.simulated import KinectErrors
 from body_tracking.kinematics.conventions import convention
 from body_tracking.kinematics.upper_body import UpperBody
@@ -266,6 +267,30 @@ def test_the_angles_follow_the_truth(replayed_wave: Path, tmp_path: Path) -> Non
     for found, truth in zip(*elbows(replayed_wave), strict=True):
         known = np.isfinite(found)
         assert np.corrcoef(found[known], truth[known])[0, 1] > 0.8
+
+
+@pytest.mark.parametrize("words", some([("--smooth",), ("--lag", "0.15")]))
+def test_smoothing_loses_no_frame_and_trembles_less(
+    wave: Path, replayed_wave: Path, tmp_path: Path, command: Command, words: tuple[str, ...]
+) -> None:
+    code, _, error = command("replay", wave, "-o", tmp_path / "out", *words)
+    assert code == 0, error
+    stamps, trembling = [], []
+    for folder in (tmp_path / "out", replayed_wave):
+        with BagReader(folder) as bag:
+            angles = [deserialize(JOINT_STATE, raw.cdr) for raw in bag.messages([ANGLES])]
+        stamps.append([to_nanoseconds(each.header.stamp) for each in angles])
+        trembling.append(float(np.nanmedian(np.abs(np.diff(elbows(folder)[0], 2, axis=1)))))
+    assert stamps[0] == stamps[1]
+    assert trembling[0] < trembling[1]
+
+
+def test_only_a_replay_smooths_by_more_than_a_live_graph(wave: Path, tmp_path: Path, command: Command) -> None:
+    assert ReplaySettings(smooth=True).values()["skeleton_filter"]["lag"] > MAX_LAG
+    code, _, error = command("replay", wave, "-o", tmp_path / "out", "--lag", MAX_LAG + 0.1)
+    assert code == 2
+    assert "lag" in error
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_command_prints_a_report(wave: Path, tmp_path: Path, command: Command) -> None:

@@ -284,7 +284,7 @@ class ExtendedKalmanFilter:
         state = self._state
         assert state is not None
         skeleton = self._newest or self._empty(state.stamp_ns)
-        return Frame(state, skeleton, sum(self.counters[name] for name in _BREAKS), self._smoother.split(state))
+        return self._smoother.frame(state, skeleton, sum(self.counters[name] for name in _BREAKS))
 
     def link(self, before: Frame, after: Frame) -> Link | None:
         """As of :class:`Smoother`."""

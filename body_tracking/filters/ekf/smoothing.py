@@ -1,11 +1,13 @@
 """Fixed-lag smoothing of the extended filter: the backward pass of ``filters.smoothing`` on the manifold.
 
-Lengths that are only considered, slow errors of cameras and errors of sources of orientations persist over the lag: no
-later frame averages them out. So the covariance is split into a part by these errors c, ``S S^T`` with
-``S = P_xc L^-T`` and ``P_cc = L L^T``, and the rest ``N``, which is the error's covariance for known c. Gains follow
-from ``N`` alone, and with the prediction (-) and the smoothed estimate (s) of the next frame
+Known lengths, slow errors of cameras and errors of sources of orientations persist over the lag: no later frame
+averages them out. With ``P_xc`` the covariance of pose and velocities with these errors, and ``P_cc`` their own,
 
-    G = N F^T (N-)^-1,    N_s = N + G (N_s' - N-) G^T,    S_s = S + G (S_s' - S-),    P_s = N_s + S_s S_s^T.     (1)
+    N = P - P_xc P_cc^-1 P_cx                                                                                 (1)
+
+is the covariance for known c. Gains follow from ``N`` alone, and it alone shrinks (' the next frame, - its prediction):
+
+    G = N F^T (N-')^-1,    N_s = N + G (N_s' - N-') G^T,    P_s = P + N_s - N.                                (2)
 
 The errors of configurations are taken in the tangents of the prediction and of the smoothed one alike: they are degrees
 apart.
@@ -25,22 +27,7 @@ from body_tracking.filters.ekf.state import State, StateSpace
 from body_tracking.filters.smoothing import backward_gain, smoothed_covariance
 
 _LEAST_SHARE = 1e-6
-"""Share of each variance that is added where rounding, in single precision, may have left none."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Split:
-    """The covariance of what is smoothed (n), by what it comes from.
-
-    Attributes:
-        free: (n, n) N.
-        persisting: (n, c) S.
-        root: (c, c) L, lower.
-    """
-
-    free: FloatArray
-    persisting: FloatArray
-    root: FloatArray
+"""Share of each variance that stays where rounding, as the slow errors are in single precision, leaves none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,13 +38,15 @@ class Frame:
         state: of the filter.
         skeleton: the sensor's.
         epoch: changes where a pose is not the continuation of the one before.
-        split: of the state's covariance.
+        free: (n, n) N of the filter; n as of :meth:`Smoother.free`.
+        smoothed: (n, n) N_s.
     """
 
     state: State
     skeleton: Skeleton
     epoch: int
-    split: Split
+    free: FloatArray
+    smoothed: FloatArray
 
     @property
     def stamp_ns(self) -> int:
@@ -66,17 +55,11 @@ class Frame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Link:
-    """Between two frames.
-
-    Attributes:
-        gain: (n, n) G.
-        prior: the prediction of the later one.
-        split: of its covariance.
-    """
+    """Between two frames: (n, n) gain, and the prediction of the later one with its (n, n) N."""
 
     gain: FloatArray
     prior: State
-    split: Split
+    free: FloatArray
 
 
 class Smoother:
@@ -92,70 +75,70 @@ class Smoother:
         self._pose = np.r_[space.tangent, space.velocities]
         self._all = np.arange(space.size)
 
-    def _parts(self, state: State) -> tuple[IntArray, IntArray]:
-        """(n,) indices of what is smoothed: pose and velocities, lengths while they are estimated; (k,) of the rest."""
-        own = self._pose if state.settled else self._all
-        return own, np.setdiff1d(np.arange(len(state.covariance)), own)
+    def frame(self, state: State, skeleton: Skeleton, epoch: int) -> Frame:
+        """The estimate after a frame."""
+        try:
+            free = self.free(state)
+        except np.linalg.LinAlgError:
+            own = self._own(state)
+            free, epoch = state.covariance[np.ix_(own, own)], -state.stamp_ns  # no other one has this epoch
+        return Frame(state, skeleton, epoch, free, free)
 
-    def split(self, state: State) -> Split:
-        """The split covariance of a state.
+    def _own(self, state: State) -> IntArray:
+        """(n,) indices of what is smoothed: pose and velocities, and lengths while they are estimated."""
+        return self._pose if state.settled else self._all
+
+    def free(self, state: State) -> FloatArray:
+        """(n, n) N of equation 1.
 
         Raises:
-            LinAlgError: its covariance is none.
+            LinAlgError: the covariance is none.
         """
-        own, rest = self._parts(state)
-        covariance, crosses = state.covariance, state.crosses.astype(np.float64)
-        count = len(rest) + crosses.shape[1]
-        considered = np.eye(count)
-        considered[: len(rest), : len(rest)] = covariance[np.ix_(rest, rest)]
-        considered[: len(rest), len(rest) :] = crosses[rest]
-        considered[len(rest) :, : len(rest)] = crosses[rest].T
-        considered.reshape(-1)[:: count + 1] *= 1.0 + _LEAST_SHARE
-        root = cholesky(considered) if count else considered
-        cross = np.concatenate([covariance[np.ix_(own, rest)], crosses[own]], axis=1)
-        persisting = dtrtrs(root, cross.T, lower=1)[0].T if count else cross
-        free = covariance[np.ix_(own, own)] - persisting @ persisting.T
-        free.reshape(-1)[:: len(own) + 1] += _LEAST_SHARE * covariance.diagonal()[own]
-        return Split(free, persisting, root)
+        own, crosses = self._own(state), state.crosses.astype(np.float64)
+        rest = np.setdiff1d(np.arange(len(state.covariance)), own)
+        free = state.covariance[np.ix_(own, own)]
+        if count := len(rest) + crosses.shape[1]:
+            persisting = np.eye(count)  # slow errors of cameras have unit variance
+            persisting[: len(rest), : len(rest)] = state.covariance[np.ix_(rest, rest)]
+            persisting[: len(rest), len(rest) :] = crosses[rest]
+            persisting[len(rest) :, : len(rest)] = crosses[rest].T
+            persisting.reshape(-1)[:: count + 1] *= 1.0 + _LEAST_SHARE
+            cross = np.concatenate([state.covariance[np.ix_(rest, own)], crosses[own].T])
+            white, _ = dtrtrs(cholesky(persisting), cross, lower=1)
+            free -= white.T @ white
+        free.reshape(-1)[:: len(own) + 1] += _LEAST_SHARE * state.covariance.diagonal()[own]
+        return free
 
     def link(self, before: Frame, after: Frame) -> Link | None:
         """The gain between two frames; None where the later one does not continue the earlier one."""
         a, b = before.state, after.state
-        replaced = a.settled and b.settled and a.lengths is not b.lengths and (a.lengths != b.lengths).any()
-        same = a.settled == b.settled and a.slow_names == b.slow_names and len(a.covariance) == len(b.covariance)
-        if before.epoch != after.epoch or replaced or not same:
+        replaced = a.settled and not np.array_equal(a.lengths, b.lengths)
+        if before.epoch != after.epoch or a.settled != b.settled or replaced:
             return None
-        prior = self._motion.predicted(a, b.stamp_ns)
+        prior, own = self._motion.predicted(a, b.stamp_ns), self._own(a)
+        cross = np.zeros((self._space.size, len(own)))
+        cross[own] = before.free
+        self._motion.carry(cross, a, b.stamp_ns)
         try:
-            split = self.split(prior)
-            own, _ = self._parts(a)
-            moved = np.zeros((len(a.covariance), len(own)))
-            moved[own] = before.split.free
-            self._motion.carry(moved, a, b.stamp_ns)
-            return Link(backward_gain(moved[own], split.free), prior, split)
+            free = self.free(prior)
+            return Link(backward_gain(cross[own], free), prior, free)
         except np.linalg.LinAlgError:
             return None
 
     def smoothed(self, frame: Frame, link: Link, later: Frame) -> Frame:
-        """Equation 1."""
-        space, state, prior = self._space, frame.state, link.prior
-        own, _ = self._parts(state)
-        change = np.zeros(len(state.covariance))
-        change[space.tangent] = self._model.difference(prior.q, later.state.q)
-        change[space.lengths] = later.state.lengths - prior.lengths
-        change[space.velocities] = later.state.velocity - prior.velocity
+        """Equation 2."""
+        space, own, after, prior = self._space, self._own(frame.state), later.state, link.prior
+        change = np.zeros(space.size)
+        change[space.tangent] = self._model.difference(prior.q, after.q)
+        change[space.lengths] = after.lengths - prior.lengths
+        change[space.velocities] = after.velocity - prior.velocity
         correction = np.zeros(space.size)
         correction[own] = link.gain @ change[own]
-        persisting = frame.split.persisting + link.gain @ (later.split.persisting - link.split.persisting)
-        free = smoothed_covariance(frame.split.free, link.gain, later.split.free, link.split.free)
-        split = Split(free, persisting, frame.split.root)
-        return replace(frame, state=space.moved(state, correction), split=split)
+        smoothed = smoothed_covariance(frame.free, link.gain, later.smoothed, link.free)
+        return replace(frame, state=space.moved(frame.state, correction), smoothed=smoothed)
 
     def state_of(self, frame: Frame) -> State:
-        """The state with its covariance put together again."""
-        own, rest = self._parts(frame.state)
-        covariance, split = frame.state.covariance.copy(), frame.split
-        covariance[np.ix_(own, own)] = split.free + split.persisting @ split.persisting.T
-        cross = (split.persisting @ split.root.T)[:, : len(rest)]
-        covariance[np.ix_(own, rest)], covariance[np.ix_(rest, own)] = cross, cross.T
+        """The state with its smoothed covariance."""
+        own, covariance = self._own(frame.state), frame.state.covariance.copy()
+        covariance[np.ix_(own, own)] += frame.smoothed - frame.free
         return frame.state.but(covariance=covariance)
