@@ -237,7 +237,7 @@ def _outputs(
             continue
         if lag:
             assert isinstance(chosen, SmoothableFilter)
-            yield from map(chosen.results_of, held.take(chosen.last_frame(), each.stamp_ns))
+            yield from map(chosen.results_of, held.take(chosen.last_frame(out), each.stamp_ns))
         else:
             yield out, chosen.estimate if isinstance(chosen, ModelFilter) else None
     if lag:

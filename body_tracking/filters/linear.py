@@ -20,7 +20,7 @@ Li and Kirubarajan 2001, section 11.2).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -39,7 +39,7 @@ from body_tracking.core.skeleton import (
     TrackingState,
 )
 from body_tracking.filters.arrival import Arrival, Arrivals
-from body_tracking.filters.smoothing import backward_gain, smoothed_covariance
+from body_tracking.filters.joint_smoothing import JointFrame, JointSmoother
 from body_tracking.filters.stacked import StackedKalmanFilter
 from body_tracking.kinematics.motion import ACCELERATION_DENSITIES, joint_densities
 
@@ -75,46 +75,6 @@ def _towards_trunk() -> IntArray:
 
 
 _TOWARDS_TRUNK = _towards_trunk()
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Frame:
-    """The estimate after one frame, for smoothing; n is 3 or 6.
-
-    Attributes:
-        skeleton: as published.
-        state: (25, n, 1) of each joint.
-        covariance: (25, n, n) of these, without the slow error.
-        slow: (25, 3, 3) covariance of the slow error.
-        alive: (25,) joints with an estimate.
-        continued: (25,) those that were not started by this frame.
-        transition: (25, n, n) from the frame before.
-        prior: (25, n, 1) predicted state.
-        prior_covariance: (25, n, n) of these, with the process noise that was used in the end.
-    """
-
-    skeleton: Skeleton
-    state: FloatArray
-    covariance: FloatArray
-    slow: FloatArray
-    alive: BoolArray
-    continued: BoolArray
-    transition: FloatArray
-    prior: FloatArray
-    prior_covariance: FloatArray
-
-    @property
-    def stamp_ns(self) -> int:
-        return self.skeleton.stamp_ns
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Link:
-    """Backward gains (25, n, n) and the predictions (25, n, 1) and (25, n, n) of the next frame."""
-
-    gain: FloatArray
-    prior: FloatArray
-    prior_covariance: FloatArray
 
 
 class FilterError(BodyTrackingError):
@@ -232,7 +192,7 @@ class LinearKalmanParameters:
         check_fields(self, "linear filter", FilterError)
 
 
-class LinearKalmanFilter:
+class LinearKalmanFilter(JointSmoother):
     """25 independent linear Kalman filters, run as one :class:`StackedKalmanFilter`.
 
     The process noise of a step of ``dt`` seconds is ``q dt`` (zero velocity: a random walk) or ``q`` times
@@ -304,7 +264,6 @@ class LinearKalmanFilter:
         self._started: BoolArray = np.zeros(N_JOINTS, dtype=bool)
         self._transition: FloatArray = np.eye(size)
         self._prior_covariance: FloatArray = np.zeros((N_JOINTS, size, size))
-        self._published: Skeleton | None = None
         self.innovation_distances: FloatArray = np.full(N_JOINTS, np.nan)
 
     def update(self, skeleton: Skeleton) -> Skeleton | None:
@@ -520,56 +479,11 @@ class LinearKalmanFilter:
             positions[~alive] = velocities[~alive] = np.nan
             covariances[~alive] = np.diag([np.inf] * 3)
             states[~alive] = TrackingState.NOT_TRACKED
-        self._published = Skeleton(
-            skeleton.stamp_ns,
-            skeleton.frame_id,
-            positions,
-            states,
-            skeleton.body,
-            covariances,
-            velocities,
-        )
-        return self._published
+        stamp_ns, frame_id, body = skeleton.stamp_ns, skeleton.frame_id, skeleton.body
+        return Skeleton(stamp_ns, frame_id, positions, states, body, covariances, velocities)
 
-    # --- smoothing (filters.smoothing)
-
-    def last_frame(self) -> _Frame:
-        """The estimate after the last frame that gave one."""
-        assert self._published is not None
-        kalman = self._kalman
-        return _Frame(
-            self._published,
-            np.array(kalman.x),
-            np.array(kalman.P),
-            self._slow,
-            self._alive,
-            self._alive & ~self._started,
-            np.broadcast_to(self._transition, kalman.P.shape),
-            np.array(kalman.x_prior),
-            np.array(self._prior_covariance),
-        )
-
-    def link(self, before: _Frame, after: _Frame) -> _Link:
-        """Backward gains; zero for joints that were started or lost in between."""
-        gain = backward_gain(after.transition @ before.covariance, after.prior_covariance)
-        gain *= (before.alive & after.continued)[:, None, None]
-        return _Link(gain, after.prior, after.prior_covariance)
-
-    def smoothed(self, frame: _Frame, link: _Link, later: _Frame) -> _Frame:
-        """Equation 1 of :mod:`body_tracking.filters.smoothing`, for every joint."""
-        state = frame.state + link.gain @ (later.state - link.prior)
-        covariance = smoothed_covariance(frame.covariance, link.gain, later.covariance, link.prior_covariance)
-        return replace(frame, state=state, covariance=covariance)
-
-    def results_of(self, frame: _Frame) -> tuple[Skeleton, None]:
-        """The published skeleton with the smoothed estimates."""
-        alive = frame.alive[:, None]
-        covariances = frame.covariance[:, :3, :3] + frame.slow
-        skeleton = replace(
-            frame.skeleton,
-            positions=np.where(alive, frame.state[:, :3, 0], np.nan),
-            covariances=np.where(alive[:, :, None], covariances, np.diag([np.inf] * 3)),
-        )
-        if self._order == 2:
-            skeleton = replace(skeleton, velocities=np.where(alive, frame.state[:, 3:, 0], np.nan))
-        return skeleton, None
+    def last_frame(self, filtered: Skeleton) -> JointFrame:
+        """The estimate after the last frame that gave one, by the skeleton of it (``filters.smoothing``)."""
+        kalman, alive, continued = self._kalman, self._alive, self._alive & ~self._started
+        posterior, prior = (kalman.x, kalman.P), (kalman.x_prior, self._prior_covariance)
+        return JointFrame.of(filtered, posterior, self._slow, alive, continued, self._transition, prior)

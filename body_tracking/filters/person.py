@@ -205,7 +205,7 @@ class PersonFilter:
         elif (filtered := self._filter.update(skeleton)) is None:
             return
         elif self._lag is not None:
-            self._hold_back(self._lag, now_ns)
+            self._hold_back(self._lag, filtered, now_ns)
         else:
             self._skeleton(filtered)
 
@@ -304,10 +304,10 @@ class PersonFilter:
         if self._lag is not None:
             self._release(self._lag.flush())
 
-    def _hold_back(self, lag: FixedLag, now_ns: int) -> None:
+    def _hold_back(self, lag: FixedLag, filtered: Skeleton | None, now_ns: int) -> None:
         """Hold the last frame back, and publish those before it that have been for long enough."""
         assert isinstance(self._filter, SmoothableFilter)
-        self._release(lag.take(self._filter.last_frame(), now_ns))
+        self._release(lag.take(self._filter.last_frame(filtered), now_ns))
 
     def _release(self, frames: Sequence[Any]) -> None:
         for frame in frames:
@@ -343,7 +343,7 @@ class PersonFilter:
             assert estimate is not None  # a frame was taken
             if self._lag is not None:
                 self._prediction.stop()
-                self._hold_back(self._lag, now_ns)
+                self._hold_back(self._lag, None, now_ns)
             else:
                 self._prediction.arrived(skeleton.stamp_ns, now_ns)
                 self._send(None, estimate)

@@ -34,8 +34,8 @@ class Frame(Protocol):
 class SmoothableFilter(Protocol):
     """A filter whose estimates can be smoothed. Frames are its own, and immutable."""
 
-    def last_frame(self) -> Any:
-        """The estimate after the last frame; there has to be one."""
+    def last_frame(self, filtered: Skeleton | None) -> Any:
+        """The estimate after the last frame, by what ``update`` made of it; filters on a model take None."""
 
     def link(self, before: Any, after: Any) -> Any:
         """The backward gains between two successive frames and the prediction; None for no relation."""

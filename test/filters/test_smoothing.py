@@ -67,8 +67,9 @@ def smoothed(estimator: SmoothableFilter, frames: Sequence[Skeleton], lag: float
     held = FixedLag(estimator, lag)
     found = []
     for each in frames:
-        if estimator.update(each) is not None:  # type: ignore[attr-defined]
-            last = estimator.last_frame()
+        filtered = estimator.update(each)  # type: ignore[attr-defined]
+        if filtered is not None:
+            last = estimator.last_frame(filtered)
             found += held.take(last, each.stamp_ns) if lag else [last]
     return found + held.flush()
 

@@ -279,7 +279,7 @@ class ExtendedKalmanFilter:
 
     # --- smoothing (filters.smoothing)
 
-    def last_frame(self) -> Frame:
+    def last_frame(self, filtered: Skeleton | None = None) -> Frame:
         """The estimate after the last frame in its order."""
         state = self._state
         assert state is not None
