@@ -70,7 +70,8 @@ LAG = Parameter(
     "lag",
     0.0,
     "fixed-lag smoothing: publish each frame this much later, corrected by the frames after it; for recording and "
-    "looking, not for control. Not with the thesis's filters; no predicted frames (predict_after) unless 0",
+    "looking, not for control. Not with the thesis's filters. Above 0, nothing is predicted while all sensors are "
+    "silent",
     unit="s",
     min=0.0,
     max=MAX_LAG,

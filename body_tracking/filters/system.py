@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from body_tracking.core.message_types import IMAGE, JOINT_STATE, POINT_CLOUD, SEGMENTS, STRING
 from body_tracking.core.parameters import Value
 from body_tracking.core.qos import RELIABLE
+from body_tracking.filters import THESIS_FILTERS
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.system import (
     NodeSpec,
@@ -37,6 +38,8 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
     defaults: dict[str, Value] = {"orientations": segments} if segments else {}
     if options["sensors"] and options["sensors"] == options["computed"]:
         defaults["kinect_arms"] = False  # joints of a fitted mesh, and no Kinect's
+    if options["lag"] and options["filter"] in THESIS_FILTERS:
+        raise graph.GraphError(f"filter {options['filter']} cannot smooth (lag)")
     chosen = asked(options, filter="filter", input="filter_input", subject="subject", people="people", lag="lag")
     yield NodeSpec(
         "skeleton_filter",

@@ -228,14 +228,16 @@ def test_nothing_is_predicted_for_a_time_of_which_frames_wait(events: list[Event
         assert len(stamps) > 40 and stamps == sorted(stamps)
 
 
-def test_orientations_alone_are_published_at_the_rate_of_predicted_frames() -> None:
+@pytest.mark.parametrize("lag", [0.0, 0.15])
+def test_orientations_alone_are_published_at_the_rate_of_predicted_frames(lag: float) -> None:
     rng = np.random.default_rng(4)
     person, motion = RandomPerson.draw(rng), RandomMotion(rng, 3.0)
     times = np.arange(0.0, 3.0, 0.02)
     rotations = MODEL.forward(motion.configuration(times), person.lengths).rotations
     published: list[tuple[str, int]] = []
     stage = PersonFilter(
-        FilterSettings("ekf", sensors=SENSORS), lambda topic, payload, stamp_ns: published.append((topic, stamp_ns))
+        FilterSettings("ekf", sensors=SENSORS, lag=lag),
+        lambda topic, payload, stamp_ns: published.append((topic, stamp_ns)),
     )
     linear = PersonFilter(FilterSettings("lkf_constant_velocity"), lambda topic, payload, stamp_ns: None)
     for time, posture in zip(times, rotations, strict=True):
