@@ -260,6 +260,8 @@ def test_other_mistakes_on_the_command_line(capsys: pytest.CaptureFixture[str], 
     assert "has no model of the body" in refusal(capsys, "--filter", "lkf_zero_velocity", "--params-file", file)
     file.write_text("skeleton_filter: {ros__parameters: {input: sensors}}")
     assert "cannot smooth" in refusal(capsys, "--filter", "thesis_lkf1", "--lag", "0.15")
+    robot = BAGS.parent / "config" / "robots" / "iiwa7.yaml"
+    assert "must not follow angles that come late" in refusal(capsys, "--robot", robot, "--lag", "0.15")
     assert "expected 0 to 0.3" in refusal(capsys, "--bag", BAG, "--lag", "0.5")
     assert "takes fused skeletons" in refusal(capsys, "--filter", "lkf_zero_velocity", "--params-file", file)
 

@@ -124,6 +124,8 @@ def options_for(args: argparse.Namespace) -> Options:
         given["convention"] = convention_of(args.robot, args.convention or "")
     given["namespace"] = names.check_namespace(args.namespace or "/")
     options = with_file(options_of(**given), args.params_file)
+    if options["robot"] and options["lag"]:
+        raise UpError("lag: a robot must not follow angles that come late")
     if args.bag is not None:
         try:
             options = {**options, "played": played(options, topics)}

@@ -13,7 +13,8 @@ from scipy.stats import chi2
 
 from body_tracking.core.parameters import check_all
 from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton
-from body_tracking.filters.ekf import EkfParameters, ExtendedKalmanFilter
+from body_tracking.filters.ekf.filter import ExtendedKalmanFilter
+from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.linear import CONSTANT_VELOCITY, LinearKalmanFilter, LinearKalmanParameters
 from body_tracking.filters.people import filter_of
 from body_tracking.filters.person import FilterSettings
