@@ -52,6 +52,7 @@ MARKERS, SETUP = "markers_arm", ROOT / "config" / "marker_setup"
 """The recording of image pairs, and what tracks the markers in it."""
 MESH = "mesh_reaching"
 """The recording of depth images."""
+SMOOTHED = "wave with a lag"
 SAME = 1e-4
 """Metres, radians and the like by which live and offline may differ: far less than anything is known to. They are equal
 to the last bit while both have the same number of BLAS threads; with another number sums round differently (4e-5)."""
@@ -191,6 +192,7 @@ def inputs(bag: Path) -> set[str]:
 
 CASES = [
     ("wave", "ekf"),
+    *((SMOOTHED, each) for each in ("ekf", "lkf_constant_velocity")),
     (MARKERS, ""),
     (MESH, ""),
     *((bag.name, each) for bag in sorted(BAGS.iterdir()) if bag.name != MARKERS for each in FILTERS),
@@ -204,7 +206,7 @@ def played(tmp_path_factory: pytest.TempPathFactory, wave: Path) -> Callable[[st
     @cache
     def play(name: str, filter_name: str) -> Path:
         folder = tmp_path_factory.mktemp(f"{name}_{filter_name}")
-        bag = wave if name == "wave" else BAGS / name
+        bag = wave if name in ("wave", SMOOTHED) else BAGS / name
         if name == MARKERS:
             bag, file = beginning(bag, folder / "excerpt", 1.5), folder / "parameters.yaml"
             file.write_text(yaml.safe_dump({"/**": {SECTION: {"max_wait": 1.0, "deadline": 1.0}}}))
@@ -214,6 +216,7 @@ def played(tmp_path_factory: pytest.TempPathFactory, wave: Path) -> Callable[[st
             arguments = ("--depth", "kinect1", "--params-file", parameters(folder))
         else:
             arguments = ("--filter", filter_name, "--params-file", parameters(folder))
+            arguments += ("--lag", "0.15") if name == SMOOTHED else ()
         assert cli.main(["replay", str(bag), "-o", str(folder / "offline"), *map(str, arguments)]) == 0
         return live_as_offline(folder, bag, arguments, inputs(bag) | OTHERS)
 
