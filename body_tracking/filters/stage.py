@@ -19,6 +19,7 @@ from body_tracking.filters import (
 from body_tracking.filters.people import PeopleFilter, filter_of
 from body_tracking.filters.person import DEFAULT_ORDER_WAIT, DEFAULT_PREDICT_AFTER, FilterSettings, PersonFilter
 from body_tracking.filters.smoothing import MAX_LAG
+from body_tracking.fusion import association
 from body_tracking.fusion.stage import calibration_inputs
 from body_tracking.messages.codecs import (
     Ids,
@@ -197,12 +198,21 @@ class FilterStage(Stage):
             Port(graph.TRACKED, Ids(), RELIABLE_QOS, optional=True),
         )
 
+    def start(self, now: Now) -> Iterable[Output]:
+        self._prepare()
+        return ()
+
+    def _prepare(self) -> None:
+        if self.filter.by_sensor:
+            association.prepare()
+
     def change(self, values: Mapping[str, Value]) -> None:
         """Start a new filter at the next frame; frames that the present one holds back are published."""
         made = self._make(values)
         self.filter.flush()
         made.inherit(self.filter)
         self.filter, self.values = made, values
+        self._prepare()
         self._connect(values)
         there = {port.topic for port in self.outputs}
         self._published = [output for output in self._published if output.topic in there]

@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 
@@ -171,6 +172,19 @@ class _Person:
         return result
 
 
+@cache
+def _min_cost_assignment() -> Callable[[FloatArray], tuple[IntArray, IntArray]]:
+    from scipy.optimize import linear_sum_assignment
+
+    found: Callable[[FloatArray], tuple[IntArray, IntArray]] = linear_sum_assignment
+    return found
+
+
+def prepare() -> None:
+    """Import what assigns: half a second, too long for a second person's first frame."""
+    _min_cost_assignment()
+
+
 class Association:
     """Assigns the bodies of calibrated sensors to people.
 
@@ -183,10 +197,6 @@ class Association:
     """
 
     def __init__(self, hold: float = HOLD) -> None:
-        # The import takes half a second: too long for a second person's first frame.
-        from scipy.optimize import linear_sum_assignment
-
-        self._min_cost_assignment = linear_sum_assignment
         self.counters: Counter[str] = Counter()
         self._hold_ns = round(hold * NANOSECONDS)
         self._number = 0
@@ -334,7 +344,7 @@ class Association:
         costs[~(distances <= np.array(gate)[:, None])] = _IMPOSSIBLE
         rows: IntArray
         columns: IntArray
-        rows, columns = self._min_cost_assignment(costs)
+        rows, columns = _min_cost_assignment()(costs)
         for row, column in zip(rows, columns, strict=True):
             if costs[row, column] < _IMPOSSIBLE:
                 whose[column] = people[row]
@@ -358,7 +368,7 @@ class Association:
         expected = np.stack([person.expected(other, stamp_ns) for person, other in present])
         distances = np.minimum(torso_distances(expected, points[columns]), 2.0 * GATE)
         now = distances[list(mine.values()), range(len(columns))].sum()
-        rows, chosen = self._min_cost_assignment(distances)
+        rows, chosen = _min_cost_assignment()(distances)
         if now - distances[rows, chosen].sum() <= _MARGIN:
             self._contested.pop(sensor, None)
             return whose
