@@ -25,6 +25,7 @@ from body_tracking.pipeline.system import (
     Service,
     System,
     TopicSpec,
+    View,
     asked,
     transport,
 )
@@ -109,5 +110,6 @@ SYSTEM = System(
     commands=(
         Command("mesh", "body_tracking.recording.mesh_commands", "the shape of a person, and pictures of the mesh"),
     ),
+    views=(View("depth", "body_tracking.viewing.mesh_view:MeshView"),),
     prepare="body_tracking.mesh.tracking:prepare",
 )

@@ -26,7 +26,7 @@ from body_tracking import systems
 from body_tracking.core import names
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.parameters import Parameter
-from body_tracking.core.qos import LATCHED, LATEST, RELIABLE
+from body_tracking.core.qos import LATCHED, LATEST, RELIABLE, Qos, request_for
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import FloatArray, Skeleton
 from body_tracking.core.sources import check_sensor_name
@@ -43,7 +43,7 @@ from body_tracking.pipeline import graph
 from body_tracking.pipeline.roles import ROLES
 from body_tracking.pipeline.shared import BODY, SENSORS
 from body_tracking.pipeline.system import load
-from body_tracking.ros.bag_topics import message_class, to_profile
+from body_tracking.ros.bag_topics import from_profile, message_class, to_profile
 from body_tracking.ros.main import run
 from body_tracking.ros.node import STEADY, GraphNode
 from body_tracking.ros.wire import WIRE, deserialized
@@ -64,7 +64,10 @@ PARAMETERS = (
     Parameter("window", 15.0, "how much of the joint angles is shown", unit="s", min=1.0, max=120.0),
     SENSORS,
     BODY,
-    *(Parameter(view.option, "", f"to show it: {systems.OPTIONS[view.option].text}") for view in systems.VIEWS),
+    *(
+        Parameter(view.option, systems.OPTIONS[view.option].default, f"to show it: {systems.OPTIONS[view.option].text}")
+        for view in systems.VIEWS
+    ),
 )
 
 _STALE_S = 1.0
@@ -115,8 +118,10 @@ class ViewerNode(GraphNode):
             for name in ("skeleton_filter", "joint_angles")
         }
         self.recent: dict[str, deque[tuple[bytes, float]]] = {}
-        self.viewed: dict[str, Any] = {}
-        """Subscriptions of the views' topics."""
+        self.viewed: dict[str, tuple[Qos, Any]] = {}
+        """Subscriptions of the views' topics, and their profiles."""
+        self.held: set[str] = set()
+        """Topics of the views whose last message holds however old it is."""
         self.page = self.open_page(given)
         for topic in (*map(graph.skeleton_topic, self.sensors), graph.FUSED, graph.FILTERED):
             self.subscribe(topic, PointCloud2, to_profile(LATEST), partial(self.on_latest, topic), raw=True)
@@ -171,19 +176,26 @@ class ViewerNode(GraphNode):
     def connect_views(self) -> None:
         """Subscribe to the topics of the views, such as images, only while a browser shows their layers."""
         wanted: dict[str, Codec] = {}
+        self.held = {topic for view in self.views for topic in view.held}
         if self.page.watched:
             for view in self.views:
                 wanted.update(view.topics(self.page.visible))
-        for topic in self.viewed.keys() - wanted.keys():
-            self.destroy_subscription(self.viewed.pop(topic))
+        profiles = {topic: self.view_profile(topic) for topic in wanted}
+        for topic in [each for each, (profile, _) in self.viewed.items() if profiles.get(each) != profile]:
+            self.destroy_subscription(self.viewed.pop(topic)[1])
             self.recent.pop(topic, None)
         for topic in wanted.keys() - self.viewed.keys():
             self.codecs[topic] = wanted[topic]
             kind = message_class(wanted[topic].type_name)
             self.recent[topic] = deque(maxlen=_RECENT)
-            self.viewed[topic] = self.subscribe(
-                topic, kind, to_profile(LATEST), partial(self.on_recent, topic), raw=True
-            )
+            profile = to_profile(profiles[topic])
+            subscription = self.subscribe(topic, kind, profile, partial(self.on_recent, topic), raw=True)
+            self.viewed[topic] = profiles[topic], subscription
+
+    def view_profile(self, topic: str) -> Qos:
+        """The profile of a view's subscription: what the publishers offer where the last message is needed."""
+        publishers = self.get_publishers_info_by_topic(self.full_name(topic)) if topic in self.held else ()
+        return request_for([from_profile(each.qos_profile) for each in publishers], 1) if publishers else LATEST
 
     def on_recent(self, topic: str, cdr: bytes, sent_ns: int) -> None:
         self.monitor.totals["received"] += 1
@@ -237,10 +249,10 @@ class ViewerNode(GraphNode):
         if self.views:
             kept = dict(self.recent)  # the other thread changes it
             fresh = {
-                topic: [cdr for cdr, received in list(each) if now - received <= _STALE_S]
+                topic: [cdr for cdr, received in list(each) if topic in self.held or now - received <= _STALE_S]
                 for topic, each in kept.items()
             }
-            self.page.draw_views(fresh, self.decoded)
+            self.page.draw_views(fresh, self.decoded, dict(self.poses))
         if now - self.plotted >= 1.0 / float(str(self.values["plot_rate"])):
             self.plotted = now
             self.collect_angles()

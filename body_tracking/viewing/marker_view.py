@@ -5,7 +5,7 @@ The rig's frame, that of its first camera, is drawn as if this camera looked hor
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from body_tracking.core import so3
+from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.markers import setup
 from body_tracking.markers.chain_files import load_chain
@@ -56,6 +57,7 @@ class MarkerView:
     """
 
     body = setup.BODY
+    held: Collection[str] = ()
     layers: Mapping[str, tuple[str, bool]] = {
         _IMAGES: ("images of cameras", True),
         _CAMERAS: ("cameras", True),
@@ -110,35 +112,30 @@ class MarkerView:
                 self._images = [server.gui.add_image(black, label=name, format="jpeg") for name in self._names]
 
     def draw(
-        self, recent: Mapping[str, Sequence[bytes]], decode: Decode, visible: Mapping[str, bool]
+        self,
+        recent: Mapping[str, Sequence[bytes]],
+        decode: Decode,
+        visible: Mapping[str, bool],
+        poses: Mapping[str, SensorPose],
     ) -> FloatArray | None:
-        """Draw messages of one time.
-
-        Args:
-            recent: the latest messages of each topic; none of those that are old.
-            decode: returns the payload of a message of a topic, None for one that is malformed.
-            visible: which layers are switched on.
-
-        Returns:
-            (3,) the middle of the targets in world, or None.
-        """
+        """Draw messages of one time; returns (3,) the middle of the targets in world, or None."""
         at = {topic: {stamp_of(cdr): (topic, cdr) for cdr in each} for topic, each in recent.items() if each}
-        poses, stamp_ns = self._one_time(at, decode)
+        posed, stamp_ns = self._one_time(at, decode)
         for camera in self._cameras:
             show(camera, visible[_CAMERAS])
-        self._draw_images(at, stamp_ns, poses, decode, visible[_IMAGES])
+        self._draw_images(at, stamp_ns, posed, decode, visible[_IMAGES])
         points = _latest(at.get(setup.POINTS, {}), stamp_ns, decode) if visible[_POINTS] else None
         positions = np.empty((0, 3)) if points is None else points.positions
         self._points.draw(positions, None, np.full((len(positions), 3), _POINT))
-        seen = {pose.name: pose for pose in poses}
+        seen = {pose.name: pose for pose in posed}
         for name, frame in self._poses.items():
             show(frame, visible[_TARGETS] and name in seen)
             if name in seen:
                 frame.wxyz, frame.position = _wxyz(seen[name].rotation), seen[name].translation
-        self._draw_chain(poses if visible[_CHAIN] else [])
-        if not poses:
+        self._draw_chain(posed if visible[_CHAIN] else [])
+        if not posed:
             return None
-        middle = np.mean([pose.translation for pose in poses], axis=0)
+        middle = np.mean([pose.translation for pose in posed], axis=0)
         return np.array([middle[2], -middle[0], -middle[1]])
 
     def _one_time(

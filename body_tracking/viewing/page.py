@@ -19,6 +19,7 @@ from viser import uplot
 
 from body_tracking.core import so3
 from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import Skeleton
 from body_tracking.messages.node_status import NodeStatus
 from body_tracking.pipeline.system import Layer, load
@@ -227,11 +228,13 @@ class Page:
             if len(points):
                 self._target = np.median(points, axis=0)
 
-    def draw_views(self, recent: Mapping[str, Sequence[bytes]], decode: Decode) -> None:
-        """Update what other systems show from several topics, given the latest messages of each."""
+    def draw_views(
+        self, recent: Mapping[str, Sequence[bytes]], decode: Decode, poses: Mapping[str, SensorPose]
+    ) -> None:
+        """Update what other systems show from several topics; arguments as of :meth:`SystemView.draw`."""
         with self._server.atomic():
             for view in self._views:
-                where = view.draw(recent, decode, self.visible)
+                where = view.draw(recent, decode, self.visible, poses)
                 if where is not None:
                     self._target = where
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeAlias
 
@@ -46,10 +46,12 @@ class SystemView(Protocol):
     Attributes:
         layers: what can be switched on and off: label, and whether it is on at first, by name.
         body: the person whose angles are shown where there are no sensors of skeletons; empty for none.
+        held: topics whose last message holds until the next one, however old, such as calibrations of cameras.
     """
 
     layers: Mapping[str, tuple[str, bool]]
     body: str
+    held: Collection[str]
 
     def topics(self, visible: Mapping[str, bool]) -> Mapping[str, Codec]:
         """The topics that it takes while these layers are on, and the codecs of their messages."""
@@ -58,9 +60,23 @@ class SystemView(Protocol):
         """Make its parts in viser's scene and panels."""
 
     def draw(
-        self, recent: Mapping[str, Sequence[bytes]], decode: Decode, visible: Mapping[str, bool]
+        self,
+        recent: Mapping[str, Sequence[bytes]],
+        decode: Decode,
+        visible: Mapping[str, bool],
+        poses: Mapping[str, SensorPose],
     ) -> FloatArray | None:
-        """Draw the latest messages; returns (3,) where to look, metres in world, or None."""
+        """Draw the latest messages.
+
+        Args:
+            recent: the latest messages of each topic, in the order of their arrival; none of those that are old.
+            decode: returns the payload of a message of a topic, None for one that is malformed.
+            visible: which layers are switched on.
+            poses: of calibrated sensors, by name.
+
+        Returns:
+            (3,) where to look, metres in world, or None.
+        """
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -97,7 +97,7 @@ def show(page: Page, view: MarkerView, recent: dict[str, list[bytes]]) -> None:
 
     nothing = np.empty((0, 3)), np.empty((0, 4))
     page.draw(Snapshot({}, {}, NOBODY, NOBODY, *nothing))
-    page.draw_views(recent, decode)
+    page.draw_views(recent, decode, {})
 
 
 def coloured(view: MarkerView) -> list[int]:
