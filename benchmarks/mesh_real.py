@@ -27,10 +27,10 @@ from common import recordings, report, verdicts
 from body_tracking.core import so3
 from body_tracking.core.camera import Camera
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, SingleArray
+from body_tracking.mesh.body_index import NO_BODY
 from body_tracking.mesh.body_model import Body, load
 from body_tracking.mesh.depth import DepthCamera, to_metres
 from body_tracking.mesh.energy import Observation
-from body_tracking.mesh.person import NO_BODY
 from body_tracking.mesh.personalisation import Person, personalise
 from body_tracking.mesh.picture import overlay
 from body_tracking.mesh.raster import render

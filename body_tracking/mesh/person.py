@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from body_tracking.core.camera import Camera
 from body_tracking.core.compiled import compiled
 from body_tracking.core.skeleton import BoolArray, FloatArray, SingleArray
-from body_tracking.mesh.depth import DepthCamera, DepthError
+from body_tracking.mesh.depth import DepthCamera
 
 _CLEARANCE: Final = 0.05
 """Metres by which a person is nearer than the background, or above the floor; 12 standard deviations at 4.8 m."""
@@ -25,7 +25,7 @@ _REVEALED, _SMALL, _ABSORBED = 3, 30, 300
 """Frames after which a farther surface becomes a pixel's background, a small one, and what may be a person."""
 _GRAZING: Final = 5.7
 """Largest slope of a surface against the image plane: 80 degrees. Steeper than that are jumps between surfaces."""
-_REACH: Final = 0.25
+REACH: Final = 0.25
 """Metres about the predicted mesh in which the person is looked for: 7.5 m/s at 30 Hz."""
 _PERSON_AREA: Final = (0.12, 1.6)
 """Square metres that the camera sees of a person: of a child from the side, and of a large man with his arms out."""
@@ -44,8 +44,6 @@ _HEAD: Final = 0.3
 """The same upwards in the image: the chin may cut the head off from the trunk."""
 _COVERED: Final = 0.02
 """Share of pixels with a distance below which a lens is covered."""
-NO_BODY: Final = 255
-"""Pixel of a body-index image that belongs to nobody (Kinect SDK 2.0)."""
 
 COVERED = "hardly any pixel has a distance: is the lens covered?"
 NOBODY = "nobody is seen"
@@ -114,7 +112,7 @@ class PersonFinder:
             DepthError: another size than the camera's.
         """
         self._view.check(depth)
-        if np.count_nonzero(depth) < _COVERED * depth.size:
+        if is_covered(depth):
             return Found(np.zeros(depth.shape, np.bool_), 0, COVERED)
         if self.floor is None and self._looks < 30:
             self._looks += 1
@@ -122,7 +120,7 @@ class PersonFinder:
         up, height = (np.zeros(3), 1.0) if self.floor is None else (self.floor.up, self.floor.height)
         candidates = _candidates(depth, self._view.rays, self._background, up, height, _CLEARANCE)
         if predicted is not None:
-            candidates &= near(predicted, depth, self._view.camera, _REACH)
+            candidates &= near(predicted, depth, self._view.camera, REACH)
         labels, count = _surfaces(depth, candidates, 2.0 * _GRAZING / self._view.camera.matrix[0, 0])
         areas, boxes, attached = _measure(depth, self._view.rays, labels, count, self._background, _CLEARANCE)
         free = attached < _ATTACHED
@@ -138,6 +136,11 @@ class PersonFinder:
         patience = np.concatenate([[_SMALL], frames]).astype(np.int16)
         _learn(self._background, self._other, self._stays, depth, labels, patience, _CLEARANCE, _REVEALED)
         return Found(mask, people, "" if people else NOBODY)
+
+
+def is_covered(depth: SingleArray) -> bool:
+    """Whether hardly any pixel of an image has a distance."""
+    return bool(np.count_nonzero(depth) < _COVERED * depth.size)
 
 
 def _person_among(
@@ -162,36 +165,6 @@ def _person_among(
     own = chosen & ~alike & (boxes[:, 0] > low).all(axis=1) & (boxes[:, 1] < high).all(axis=1)
     own[nearest] = True
     return own, alike | own, len(numbers)
-
-
-def of_body_index(
-    index: NDArray[np.uint8], depth: SingleArray, body: int | None = None
-) -> tuple[BoolArray, int | None]:
-    """The person of a body-index image, as the Kinect SDK gives it, and the number in it.
-
-    Args:
-        index: (height, width) number of the body at each pixel, 255 for none.
-        depth: (height, width) metres, 0 where missing.
-        body: the number that was tracked so far, kept while it is seen; else the nearest body is taken.
-
-    Returns:
-        The mask, and the number; None where nobody is seen.
-
-    Raises:
-        DepthError: the two images differ in size.
-    """
-    if index.shape != depth.shape:
-        raise DepthError(f"body-index image of {index.shape} for a depth image of {depth.shape}")
-    there = (index != NO_BODY) & (depth > 0.0)
-    counts = np.bincount(index[there], minlength=NO_BODY)
-    if not counts.any():
-        return np.zeros(depth.shape, np.bool_), None
-    if body is None or not counts[body]:
-        distances = np.bincount(index[there], weights=depth[there], minlength=NO_BODY) / np.maximum(counts, 1)
-        # some hundred stray pixels are no body
-        distances[counts < 0.05 * counts.max()] = np.inf
-        body = int(np.argmin(distances))
-    return there & (index == body), body
 
 
 def find_floor(view: DepthCamera, depth: SingleArray, tilt: float = 0.7, tolerance: float = 0.02) -> Floor | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,13 +18,22 @@ from body_tracking.core.sources import check_sensor_name, optical_frame
 from body_tracking.fusion.placement import Placement
 from body_tracking.fusion.stage import calibration_inputs
 from body_tracking.mesh import body_model, storage
+from body_tracking.mesh.body_index import IndexArray, IndexPairs
 from body_tracking.mesh.body_model import Body
-from body_tracking.mesh.codecs import DepthImage, DepthInfo, MeshMarker
+from body_tracking.mesh.codecs import BodyIndex, DepthImage, DepthInfo, MeshMarker
 from body_tracking.mesh.depth import DepthCamera, DepthError
 from body_tracking.mesh.person import COVERED
 from body_tracking.mesh.personalisation import DistinctPoses, PersonalisationError, personalise
 from body_tracking.mesh.sensor_orientations import SensorOrientations
-from body_tracking.mesh.topics import IMAGES, PERSONALISE_SERVICE, depth_topic, info_topic, mesh_sensor, mesh_topic
+from body_tracking.mesh.topics import (
+    IMAGES,
+    PERSONALISE_SERVICE,
+    body_index_topic,
+    depth_topic,
+    info_topic,
+    mesh_sensor,
+    mesh_topic,
+)
 from body_tracking.mesh.tracking import MeshTracker, Tracked, TrackerParameters, prepare
 from body_tracking.messages.codecs import Orientation, SensorClock, Skeletons
 from body_tracking.pipeline import graph
@@ -91,22 +100,25 @@ class MeshStage(Stage):
         reliable = bool(values["reliable"])
         inputs, outputs = [], []
         self._by_topic: dict[str, DepthSensor] = {}
+        self._bodies: dict[str, DepthSensor] = {}
         for camera, sensor in self.sensors.items():
-            info, images = info_topic(camera), depth_topic(camera)
+            info, images, bodies = info_topic(camera), depth_topic(camera), body_index_topic(camera)
+            inputs.append(Port(info, DepthInfo(), LATCHED, foreign=True))
             inputs += [
-                Port(info, DepthInfo(), LATCHED, foreign=True),
                 Port(
-                    *(images, DepthImage(), IMAGES, _KEPT if reliable else 0),
+                    *(topic, codec, IMAGES, _KEPT if reliable else 0),
                     droppable=not reliable,
                     perishable=not reliable,
                     foreign=True,
-                ),
+                )
+                for topic, codec in ((bodies, BodyIndex()), (images, DepthImage()))
             ]
             outputs += [
                 Port(sensor.skeleton_topic, Skeletons(), skeleton_qos(values), measured=True),
                 Port(sensor.mesh_topic, MeshMarker(), RELIABLE),
             ]
-            self._by_topic |= {info: sensor, images: sensor}
+            self._by_topic |= dict.fromkeys((info, images, bodies), sensor)
+            self._bodies[bodies] = sensor
         self._segments = {graph.orientation_topic(each): each for each in segments}
         if segments:
             inputs += calibration_inputs(len(cameras), _CALIBRATIONS)
@@ -126,10 +138,30 @@ class MeshStage(Stage):
         if isinstance(payload, Camera):
             sensor.calibrate(payload)
             return
-        stamp_ns, _, depth = payload
-        tracked = sensor.update(stamp_ns, depth, self._orientations)
-        if tracked is None:
-            return
+        stamp_ns, _, pixels = payload
+        if topic in self._bodies:
+            sensor.pairs.add_index(stamp_ns, pixels)
+        else:
+            sensor.pairs.add_depth(stamp_ns, pixels, now.steady_ns)
+        yield from self._of(sensor, now.steady_ns)
+
+    def poll(self, steady_ns: int) -> Iterable[Output]:
+        for sensor in self.sensors.values():
+            yield from self._of(sensor, steady_ns)
+
+    @property
+    def deadline_ns(self) -> int | None:
+        waiting = [each.pairs.deadline_ns for each in self.sensors.values()]
+        return min((each for each in waiting if each is not None), default=None)
+
+    def _of(self, sensor: DepthSensor, steady_ns: int) -> Iterator[Output]:
+        """The outputs of the images that need not wait for a body index any more."""
+        while (pair := sensor.pairs.next(steady_ns)) is not None:
+            tracked = sensor.update(pair.stamp_ns, pair.depth, self._orientations, pair.bodies)
+            if tracked is not None:
+                yield from self._outputs(sensor, pair.stamp_ns, tracked)
+
+    def _outputs(self, sensor: DepthSensor, stamp_ns: int, tracked: Tracked) -> Iterator[Output]:
         frame_id = optical_frame(sensor.name)
         yield Output(sensor.skeleton_topic, (tracked.skeleton(frame_id),), stamp_ns)
         if self.wanted(sensor.mesh_topic) and sensor.mesh_is_due(stamp_ns):
@@ -153,19 +185,31 @@ class MeshStage(Stage):
 
     def refused(self, topic: str) -> None:
         """Count a message of another encoding, or a calibration that cannot be used."""
+        if topic in self._bodies:
+            self._bodies[topic].pairs.refuse()
+            return
         counters = self._by_topic[topic].counters if topic in self._by_topic else self._counters
         counters["messages that cannot be used"] += 1
 
     def reset(self, topic: str) -> None:
-        """Forget the person, not the shape of the body; or the orientations of one segment."""
-        if topic in self._by_topic:
+        """Forget the person, not the shape of the body; the body-index images, or the orientations of one segment."""
+        if topic in self._bodies:
+            self._bodies[topic].pairs.forget_indices()
+        elif topic in self._by_topic:
             self._by_topic[topic].reset()
         elif topic in self._segments:
             self._orientations.forget(self._segments[topic])
 
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
-        """A camera without calibration, with images of another size, or whose lens is covered is named."""
-        problems = [f"{name}: {sensor.problem}" for name, sensor in self.sensors.items() if sensor.problem]
+        """A camera without calibration, with images of another size, or whose lens is covered is named, and body-index
+        images that cannot be used.
+        """
+        problems = [
+            f"{name}: {problem}"
+            for name, sensor in self.sensors.items()
+            for problem in (sensor.problem, sensor.pairs.problem)
+            if problem
+        ]
         values = {
             f"{name} {key}": each for name, sensor in self.sensors.items() for key, each in sensor.state().items()
         }
@@ -197,6 +241,7 @@ class DepthSensor:
         body: of the person.
         problem: why images are of no use; "" where they are, or where only nobody is there.
         placement: pose of the camera in ``world``, and its clock, by the calibration.
+        pairs: the depth images that wait for their body index.
 
     Raises:
         PersonFileError: the file of the person is invalid.
@@ -223,6 +268,7 @@ class DepthSensor:
         self._poses = DistinctPoses(self._model, 0 if self._known else self._needed)
         self._tracker: MeshTracker | None = None
         self._counters: Counter[str] = Counter()
+        self.pairs = IndexPairs(body_index_topic(camera), self._counters)
 
     @property
     def counters(self) -> Counter[str]:
@@ -244,8 +290,16 @@ class DepthSensor:
         )
         self.problem = ""
 
-    def update(self, stamp_ns: int, depth: Any, worn: SensorOrientations) -> Tracked | None:
+    def update(
+        self, stamp_ns: int, depth: Any, worn: SensorOrientations, index: IndexArray | None = None
+    ) -> Tracked | None:
         """The person in an image, with the orientations of the inertial sensors that the person wears.
+
+        Args:
+            stamp_ns: of the image.
+            depth: (height, width) metres, 0 where missing.
+            worn: the inertial sensors.
+            index: (height, width) body-index image of the same time, where there is one.
 
         Raises:
             DepthError: another size than that of the calibration.
@@ -258,7 +312,7 @@ class DepthSensor:
         names = self._model.joint_names
         orientations = worn.seen_from(self.placement, stamp_ns, names, self._counters)
         try:
-            tracked = self._tracker.update(stamp_ns, depth, orientations=orientations)
+            tracked = self._tracker.update(stamp_ns, depth, index, orientations)
         except DepthError as error:
             self._counters["images of another size"] += 1
             self.problem = str(error)
@@ -310,6 +364,7 @@ class DepthSensor:
     def reset(self) -> None:
         """Forget the person and the background; the newest pose and clock of the camera hold from now on."""
         self.placement.restart()
+        self.pairs.forget_depth()
         if self._tracker is not None:
             self._tracker.reset()
 

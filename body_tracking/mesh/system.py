@@ -9,6 +9,7 @@ from body_tracking.core.parameters import Value
 from body_tracking.core.qos import RELIABLE
 from body_tracking.mesh.topics import (
     PERSONALISE_SERVICE,
+    body_index_topic,
     depth_topic,
     info_topic,
     mesh_sensor,
@@ -55,7 +56,7 @@ def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
     for topic in wanted:
         if topic not in topics:
             raise graph.GraphError(f"no topic {topic}")
-    return wanted
+    return (*wanted, *(topic for topic in map(body_index_topic, _cameras(options)) if topic in topics))
 
 
 SYSTEM = System(

@@ -32,7 +32,7 @@ def info_topic(sensor: str) -> str:
 
 
 def body_index_topic(sensor: str) -> str:
-    """Which body each pixel belongs to, from sensors that tell it."""
+    """Of sensors that have it: the number of the body at each pixel, 255 for none; with the stamps of depth images."""
     return f"/{sensor}/body_index/image_raw"
 
 

@@ -21,10 +21,11 @@ from body_tracking.core import so3
 from body_tracking.core.camera import Camera
 from body_tracking.core.parameters import number_field
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, SingleArray, Skeleton, TrackingState
+from body_tracking.mesh.body_index import of_body_index
 from body_tracking.mesh.body_model import Body, Pose, load
 from body_tracking.mesh.depth import JUMP, LEAST, DepthCamera, supported
 from body_tracking.mesh.energy import Observation, observe
-from body_tracking.mesh.person import NOBODY, PersonFinder, of_body_index
+from body_tracking.mesh.person import COVERED, NOBODY, REACH, PersonFinder, is_covered, near
 from body_tracking.mesh.personalisation import personalise
 from body_tracking.mesh.raster import render
 from body_tracking.mesh.solver import SCALES, WIDE, Fit, JointPoints, MeshFitter, Orientation, Prediction
@@ -125,7 +126,6 @@ class MeshTracker:
         self._searched_ns: int | None = None
         self._arms_ns: int | None = None
         self._choice = 0
-        self._body_number: int | None = None
         self.problem = NOBODY
         self.observation: Observation | None = None
 
@@ -165,8 +165,7 @@ class MeshTracker:
         self.counters["images"] += 1
         expected = self._fits[-1][1] if self._fits else None
         if index is not None:
-            mask, self._body_number = of_body_index(index, depth, self._body_number)
-            self.problem = "" if mask.any() else NOBODY
+            mask = self._indexed(index, depth, expected)
         else:
             found = self._finder.find(depth, None if expected is None else expected.posed.vertices, self._choice)
             mask, self.problem = found.mask, found.reason
@@ -193,6 +192,14 @@ class MeshTracker:
         self._fits = [*self._fits[-1:], (stamp_ns, fit)]
         result = placed(self._fitter, fit, self.observation, self._landmarks, self._shape_covariance)
         return Tracked(stamp_ns, fit, result.points, result.covariance)
+
+    def _indexed(self, index: NDArray[np.uint8], depth: SingleArray, expected: Fit | None) -> BoolArray:
+        """The person's pixels by a body-index image."""
+        self._view.check(depth)
+        close = None if expected is None else near(expected.posed.vertices, depth, self._view.camera, REACH)
+        mask, body = of_body_index(index, depth, close, self._choice)
+        self.problem = COVERED if is_covered(depth) else NOBODY if body is None else ""
+        return mask
 
     def _fit(
         self, stamp_ns: int, seen: Observation, orientations: Sequence[Orientation], skeleton: Skeleton | None

@@ -18,7 +18,7 @@ from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.mesh.codecs import DepthImage, DepthInfo, MeshMarker
 from body_tracking.mesh.picture import overlay
 from body_tracking.mesh.stage import MeshStage
-from body_tracking.mesh.topics import depth_topic, info_topic, mesh_topic
+from body_tracking.mesh.topics import body_index_topic, depth_topic, info_topic, mesh_topic
 from body_tracking.messages.cdr import stamp_of
 from body_tracking.pipeline.offline import OfflineRunner
 from body_tracking.recording.progress import Progress
@@ -62,7 +62,8 @@ def personalise(bag_path: Path, camera: str, out: Path) -> str:
     runner = OfflineRunner((stage,), BAG_WIRE, lambda topic, cdr, at_ns: None)
     with RigReader(bag_path) as bag:
         progress = Progress(bag.start_ns, bag.end_ns)
-        for topic, cdr, at_ns in _messages(bag, camera):
+        bodies = body_index_topic(camera)
+        for topic, cdr, at_ns in _messages(bag, camera, *([bodies] if bodies in bag.topics else [])):
             runner.push(topic, cdr, at_ns)
             progress.at(at_ns)
             if sensor.counters["personalisations"]:

@@ -8,7 +8,7 @@ from depth_shapes import camera, dummy, ellipsoid, joined, plane, room
 
 from body_tracking.core.skeleton import BoolArray, FloatArray, SingleArray
 from body_tracking.mesh.depth import DepthCamera, DepthError, axial_noise
-from body_tracking.mesh.person import COVERED, NOBODY, PersonFinder, find_floor, near, of_body_index
+from body_tracking.mesh.person import COVERED, NOBODY, PersonFinder, find_floor, near
 from body_tracking.mesh.raster import render
 
 VIEW = DepthCamera(camera(256, 212))
@@ -145,18 +145,3 @@ def test_near_is_about_the_mesh_in_the_image_and_in_depth() -> None:
     assert not found[~inside & (distance > (0.25 + 0.13) * np.sqrt(2.0))].any()
     assert not near(vertices, np.full_like(wall, 2.6), VIEW.camera, 0.25).any()
     assert not near(np.full((5, 3), np.nan), wall, VIEW.camera, 0.25).any()
-
-
-def test_body_index_keeps_its_person_and_starts_with_the_nearest() -> None:
-    index, depth = np.full((4, 6), 255, np.uint8), np.full((4, 6), 2.0, np.float32)
-    index[:, :3], index[:, 4:], depth[:, 4:] = 2, 5, 1.5
-    mask, body = of_body_index(index, depth)
-    assert body == 5 and mask.sum() == 8
-    mask, body = of_body_index(index, depth, 2)
-    assert body == 2 and mask.sum() == 12
-    index[index == 2] = 255
-    assert of_body_index(index, depth, 2)[1] == 5
-    mask, body = of_body_index(np.full((4, 6), 255, np.uint8), depth)
-    assert body is None and not mask.any()
-    with pytest.raises(DepthError, match="body-index image"):
-        of_body_index(index, depth[:2])
