@@ -181,7 +181,7 @@ def two_people(number: int, x: float, distance: float) -> tuple[SingleArray, Ind
     image = recording().images[stamp]
     rng = np.random.default_rng(number)
     body = body_model.load().body(np.clip(np.random.default_rng(1).standard_normal(10), -1.0, 1.0))
-    standing = MeshFitter(body).neutral(np.array([x, recording().joints[stamp][Joint.SPINE_BASE][1], distance]), 0.6)
+    standing = MeshFitter(body).neutral(np.array([x, recording().joints[stamp][Joint.SPINE_BASE][1], distance]), 0.1)
     true = render(body.posed(standing).vertices, body.model.faces, camera).depth
     seen = np.round(true + 0.003 * rng.standard_normal(true.shape), 3).astype(np.float32)
     other = (true > 0.0) & ((image == 0.0) | (seen < image))
@@ -210,7 +210,7 @@ def error(node: MeshStage, number: int, depth: SingleArray, index: IndexArray | 
 
 
 WALKS = {
-    "comes to the person's side until both touch": (np.linspace(1.0, 0.42, 12), 2.3),
+    "comes to the person's side until both touch": (np.linspace(1.1, 0.4, 12), 2.3),
     "walks past before the person": (np.linspace(1.2, -1.2, 20), 1.5),
 }
 
