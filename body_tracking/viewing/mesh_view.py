@@ -22,6 +22,8 @@ from body_tracking.viewing.handles import show
 from body_tracking.viewing.snapshot import Decode
 
 _SKIN: Final[Colour] = (214, 180, 150)
+_OPACITY: Final = 0.7
+"""Of the surface: the joints in it stay visible."""
 _WIDTH: Final = 480
 """Pixels of an image on the page."""
 _PERIOD_S: Final = 0.1
@@ -153,6 +155,7 @@ class _Surface:
                 vertices,
                 self._faces,
                 color=_SKIN,
+                opacity=_OPACITY,
                 side="double",
                 cast_shadow=False,
                 receive_shadow=False,

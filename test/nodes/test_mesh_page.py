@@ -6,6 +6,7 @@ With ``BODY_TRACKING_SCREENSHOTS=docs/images`` it writes the picture of the docu
 from __future__ import annotations
 
 import itertools
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -126,11 +127,21 @@ def test_a_browser_shows_the_mesh_and_its_image(tmp_path: Path) -> None:
             if PICTURES:
                 for note in page.locator(".mantine-Notification-closeButton").all():
                     note.dispatch_event("click")
-                for frame in played:
-                    for topic, cdr in frame.items():
-                        publishers[topic].publish(cdr)
-                    page.wait_for_timeout(100)
+                last = next(frame for frame in reversed(played) if MESH in frame)
+                taken_picture = threading.Event()
+
+                def hold() -> None:
+                    """The page shows nothing that is older than a second, and software draws for longer."""
+                    while not taken_picture.wait(0.2):
+                        for topic, cdr in last.items():
+                            publishers[topic].publish(cdr)
+
+                holding = threading.Thread(target=hold)
+                holding.start()
+                page.wait_for_timeout(5e3)
                 page.screenshot(path=Path(PICTURES) / "viewer_mesh.png", timeout=1e3 * PATIENCE)
+                taken_picture.set()
+                holding.join()
 
             # The images are taken only while they are shown, and the mesh while it or they are.
             taken: Any = publishers[IMAGES].get_subscription_count
