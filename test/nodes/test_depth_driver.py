@@ -1,4 +1,4 @@
-"""``mesh_tracker`` takes the images of drivers, whatever quality of service these offer."""
+"""``mesh_tracker`` takes the depth and body-index images of drivers, whatever quality of service these offer."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # noqa: E402
 
 from body_tracking.core.camera import Camera  # noqa: E402
 from body_tracking.mesh import body_model  # noqa: E402
-from body_tracking.mesh.codecs import DepthImage, DepthInfo  # noqa: E402
+from body_tracking.mesh.codecs import BodyIndex, DepthImage, DepthInfo  # noqa: E402
 from body_tracking.mesh.raster import render  # noqa: E402
 from body_tracking.mesh.solver import MeshFitter  # noqa: E402
-from body_tracking.mesh.topics import depth_topic, info_topic, mesh_sensor  # noqa: E402
+from body_tracking.mesh.topics import body_index_topic, depth_topic, info_topic, mesh_sensor  # noqa: E402
 from body_tracking.messages.skeletons import cloud_to_skeletons  # noqa: E402
 from body_tracking.pipeline.graph import skeleton_topic  # noqa: E402
 from body_tracking.recording.rosbag2 import BAG_WIRE  # noqa: E402
@@ -40,6 +40,8 @@ def test_images_and_calibrations_of_a_driver_that_starts_later_and_latches_nothi
         assert running.until(lambda: "mesh_tracker" in running.diagnostics, 60.0)
         infos = running.node.create_publisher(CameraInfo, info_topic("kinect1"), SENSOR_DATA)
         images = running.node.create_publisher(Image, depth_topic("kinect1"), SENSOR_DATA)
+        bodies = running.node.create_publisher(Image, body_index_topic("kinect1"), SENSOR_DATA)
+        index = np.where(seen > 0.0, 3, 255).astype(np.uint8)
         stamp_ns = 0
 
         def capture() -> bool:
@@ -47,7 +49,8 @@ def test_images_and_calibrations_of_a_driver_that_starts_later_and_latches_nothi
             stamp_ns += 33_333_333
             infos.publish(DepthInfo().encode((stamp_ns, CAMERA), BAG_WIRE))
             images.publish(DepthImage().encode((stamp_ns, "camera", depth), BAG_WIRE))
-            return bool(found)
+            bodies.publish(BodyIndex().encode((stamp_ns, "camera", index), BAG_WIRE))
+            return bool(found) and running.number("mesh_tracker", "kinect1 images with a body index") > 0
 
         assert running.until(capture, 60.0)
         (skeleton,) = cloud_to_skeletons(found[0])
