@@ -15,8 +15,8 @@ errors    of the ten joints of the thesis's model, in world, at the stamps that 
           stamps, without what a method waits for.
 
 Parts: ``main`` (every motion in layout 4), ``layouts`` (the nine layouts), ``sensitivity`` (every parameter of the
-simulator at half and at double). Means over seeds with 95 % confidence intervals (Student). ``--write`` makes
-docs/accuracy.md and its figure.
+simulator at half and at double). Means over seeds with 95 % confidence intervals (Student). ``--write`` writes
+these parts of docs/accuracy.md and its figure.
 """
 
 from __future__ import annotations
@@ -279,78 +279,58 @@ def sensitivity_part(seeds: int, workers: int, motions: Sequence[str]) -> Table:
 # --- the page
 
 DOCS = common.ROOT / "docs"
-_HEAD = """# How accurate it is
-
-## Real people against Vicon
-
-Five people exercise the right arm before one Kinect v2 and Vicon at once (UI-PRMD, 48 clips). The law of the arms'
-directions and the correlation of neighbouring joints' errors are fitted to the other four. Root mean squares in
-degrees, medians over people; `of raw` is the ratio to the Kinect's own skeleton:
-
-    python benchmarks/run.py kinect_vs_vicon
-
-| | elevation | of raw | deviation | coverage | elbow flexion | of raw | deviation | coverage |
-|---|---:|---:|---:|---:|---:|---:|---:|---:|
-| Kinect's skeleton | 7.9 | | | | 9.4 | | | |
-| `lkf_constant_velocity` | 5.2 | 0.66 | 6.2 | 1.00 | 5.8 | 0.61 | 7.2 | 0.99 |
-| `ekf` | 5.1 | 0.64 | 4.9 | 0.92 | 6.3 | 0.67 | 6.8 | 0.98 |
-| `lkf_constant_velocity`, `kinect_arms: false` | 8.0 | 1.01 | 6.2 | 0.90 | 9.4 | 1.00 | 8.0 | 0.96 |
-| `ekf`, `kinect_arms: false` | 7.8 | 0.98 | 4.9 | 0.79 | 9.7 | 1.03 | 6.8 | 0.80 |
-
-Nobody's angles get worse: with either filter each error falls by 1.6 degrees or more. `coverage` is the share of
-frames within 1.96 of the stated deviation, of the median clip; ideal is 0.95. The correlation and the settings of `ekf`
-were chosen on these people. These are slow exercises without a T-pose: other motions are judged by simulation only.
-
-## Simulated people
-
-Errors on simulated people, whose true motion is known, in front of two Kinect v2 sensors with realistic errors
-([simulator.md](simulator.md) compares them with real sensors). All methods get the same frames. Values are means over
-people with 95 % confidence intervals, in millimetres and degrees. `offsets alone` is a sensor whose only error is its
-joint-centre offsets, `one sensor` the first Kinect, `fused`, `default` and `ekf` are this package. The docstring of
-`benchmarks/accuracy.py` defines every column and error; it writes this page:
-
-    python benchmarks/run.py accuracy --write
-"""
 
 
-def page(parts: Mapping[str, Table]) -> str:
-    """docs/accuracy.md."""
-    lines = [_HEAD]
-    if "main" in parts:
-        table = parts["main"]
-        lines += [
-            f"## Every motion in layout 4, {_people(table)} people each",
-            "",
-            f"The simulator was calibrated with other people, in {', '.join(KNOWN)}.",
-            "The thesis calibrates in a T-pose. Its EKF starts from one and assumes that the base of the spine does",
-            "not move, which is wrong when people walk or squat. Motions that begin without a T-pose: "
-            f"{', '.join(_unposed(table)) or 'none'}.",
-            "",
-        ]
-        for figure, title in _TITLES.items():
-            lines += [f"### {title}", "", *_markdown(table, figure), ""]
-        lines += ["### Ratios of errors without constant offsets: this package to the thesis", "", *_ratios(table), ""]
-    if "layouts" in parts:
-        lines += [
+def page(text: str, parts: Mapping[str, Table]) -> str:
+    """docs/accuracy.md with the sections of these parts written anew; what is around them stays."""
+    for part, table in parts.items():
+        begin, end = f"<!-- {part}: written by benchmarks/accuracy.py -->\n", f"<!-- end of {part} -->\n"
+        before, found, rest = text.partition(begin)
+        assert found and end in rest, f"docs/accuracy.md has no section {part}"
+        text = f"{before}{begin}\n{chr(10).join(_section(part, table))}\n{end}{rest.partition(end)[2]}"
+    return text
+
+
+def _section(part: str, table: Table) -> list[str]:
+    people = _people(table)
+    if part == "layouts":
+        return [
             "## Layouts",
             "",
             "Mean 3D error of the default pipeline in the layouts of table 5.1 of Schlagenhauf (2017). A frame marks",
-            "the best layout of each motion.",
+            f"the best layout of each motion; {people} people each.",
             "",
             "![error by motion and layout](accuracy_layouts.svg)",
             "",
         ]
-    if "sensitivity" in parts:
-        lines += [
+    if part == "sensitivity":
+        return [
             "## Sensitivity to the simulated sensors",
             "",
             "Mean error without constant offsets over the torso twist and reaching, with each parameter of the",
             "simulator halved and doubled. The change is smaller where a parameter reaches a bound of its range.",
             "",
-            *_markdown(parts["sensitivity"], "fixed"),
+            *_markdown(table, "fixed"),
             "",
         ]
-    return "\n".join(lines)
+    lines = [
+        f"## Every motion in layout 4, {people} people each",
+        "",
+        f"The simulator was calibrated with other people, in {', '.join(KNOWN)}.",
+        "The thesis calibrates in a T-pose. Its EKF starts from one and assumes that the base of the spine does",
+        "not move, which is wrong when people walk or squat. Motions that begin without a T-pose: "
+        f"{', '.join(_unposed(table)) or 'none'}.",
+        "",
+    ]
+    for figure, title in _TITLES.items():
+        lines += [f"### {title}", "", *_markdown(table, figure), ""]
+    return [
+        *lines,
+        "### Ratios of errors without constant offsets: this package to the thesis",
+        "",
+        *_ratios(table),
+        "",
+    ]
 
 
 _TITLES = {
@@ -473,7 +453,8 @@ def main() -> int:
             parser.error(f"no such part: {part}")
     common.report(args, parts)
     if args.write:
-        (DOCS / "accuracy.md").write_text(page(parts))
+        file = DOCS / "accuracy.md"
+        file.write_text(page(file.read_text(), parts))
         if "layouts" in parts:
             draw_layouts(parts["layouts"], DOCS / "accuracy_layouts.svg")
     return 0
