@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from body_tracking.ros.node import GraphNode
 
 RCLError: type[Exception] = _rclpy.RCLError
-_LEAVE_S = 5.0
-"""Seconds for the middleware to destroy a closed node."""
+_LEAVE_S = 10.0
+"""Seconds for the middleware to destroy a closed node; with 24 nodes that end at once on a busy machine 5 may pass."""
 
 
 class _SignalHandler:
