@@ -77,7 +77,7 @@ demo-mesh: $(STAMP) ## the same with depth images: from the mesh of a body to jo
 # The tests that compute, and lint, take what is left of the processors by those that start processes; of these two run at
 # a time, and one at a time where they state how soon something happens. All of it runs, whatever fails. The workspace for
 # test/ros2 is made before, and does not count as time of the tests.
-test: $(STAMP) ## formatting, lint, types and the tests, in seven minutes
+test: $(STAMP) ## formatting, lint, types and the tests, in ten minutes
 	@$(call tests,not slow)
 
 test-all: export TEST_DRAWS = all

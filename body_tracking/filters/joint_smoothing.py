@@ -51,7 +51,7 @@ class JointFrame:
         transition: FloatArray,
         prior: tuple[FloatArray, FloatArray],
     ) -> Self:
-        """Of copies, as plain arrays; posterior and prior are state and covariance, and a transition may be shared."""
+        """Of copies; posterior and prior are state and covariance, and one transition may serve all joints."""
         x, p, x_prior, p_prior = map(np.array, (*posterior, *prior))
         return cls(
             skeleton, x, p, slow, alive.copy(), continued, np.broadcast_to(transition, p.shape), x_prior, p_prior

@@ -362,7 +362,7 @@ class LinearKalmanFilter(JointSmoother):
         self.innovation_distances = np.where(observed, distances, np.nan)
         suspects: BoolArray = np.array(distances > self._gate)
         surprise = np.clip(distances / 3.0 - _SURPRISING, 0.0, _MOST_SURPRISING - _SURPRISING)
-        self._prior_covariance = np.asarray(kalman.P_prior)
+        self._prior_covariance = kalman.P_prior
         level = self._level
         self._level = np.minimum(level + self.parameters.adaptation * surprise, _MOST_LEVEL)
         if not suspects.any():

@@ -11,8 +11,7 @@ class StackedKalmanFilter:
     """The Kalman filters of n independent states, each equation one multiplication of n matrices.
 
     The equations are those of ``filterpy.kalman.KalmanFilter`` in their order, with the covariance of the update in
-    Joseph's form. Importing filterpy takes half a second,
-    and each of its steps copies what these do not.
+    Joseph's form. They stand here because importing filterpy takes a node half a second.
 
     Attributes:
         x: (n, size, 1) states.

@@ -22,7 +22,7 @@ _WAIT_NS: Final = NANOSECONDS // 20
 """Longest wait of a depth image for its body-index image."""
 _SENT_NS: Final = NANOSECONDS
 """Difference of stamps up to which a sensor that has sent body-index images is taken to send them still."""
-_IN_VAIN: Final = 10
+_MAX_MISSES: Final = 10
 """Depth images in a row without a body-index image after which they do not wait any more."""
 _KEPT: Final = 64
 """Body-index images that wait for their depth image; 14 MB of a Kinect v2."""
@@ -100,10 +100,10 @@ class IndexPairs:
     def add_index(self, stamp_ns: int, index: IndexArray) -> None:
         """Take a body-index image."""
         self._newest_ns = stamp_ns
-        if stamp_ns in self._alone:
+        if stamp_ns in self._unpaired:
             # its depth image was not waited for, or not for long enough
             self._counters["body-index images that came too late"] += 1
-            self._vain = 0
+            self._misses = 0
             return
         self._indices[stamp_ns] = index
         if len(self._indices) > _KEPT:
@@ -120,19 +120,19 @@ class IndexPairs:
             return None
         stamp_ns, depth, since_ns = self._waiting[0]
         index, sent = self._indices.pop(stamp_ns, None), self._is_sent(stamp_ns)
-        comes = sent and self._newest_ns is not None and self._newest_ns < stamp_ns and self._vain < _IN_VAIN
+        comes = sent and self._newest_ns is not None and self._newest_ns < stamp_ns and self._misses < _MAX_MISSES
         if index is None and comes and now_ns - since_ns < _WAIT_NS:
             return None
         self._waiting.popleft()
         for other_ns in [each for each in self._indices if each < stamp_ns]:
             self._give_up(other_ns)
         if index is None:
-            self._alone.append(stamp_ns)
+            self._unpaired.append(stamp_ns)
             if sent:
-                self._vain += 1
+                self._misses += 1
                 self._counters["images without a body index"] += 1
             return Pair(stamp_ns, depth, None)
-        self._vain = 0
+        self._misses = 0
         if index.shape != depth.shape:
             self._counters["body-index images of another size"] += 1
             self._bad = f"{self._topic}: {_size(index)} pixels, the depth image has {_size(depth)}"
@@ -149,8 +149,8 @@ class IndexPairs:
     @property
     def problem(self) -> str:
         """Why body-index images are not used; "" where they are, or where there are none."""
-        if not self._bad and self._vain >= _IN_VAIN:
-            return f"{self._topic}: none has the stamp of one of the last {self._vain} depth images"
+        if not self._bad and self._misses >= _MAX_MISSES:
+            return f"{self._topic}: none has the stamp of one of the last {self._misses} depth images"
         return self._bad
 
     def forget_depth(self) -> None:
@@ -160,9 +160,9 @@ class IndexPairs:
     def forget_indices(self) -> None:
         """Forget the body-index images, as after a backward jump of their time."""
         self._indices: dict[int, IndexArray] = {}
-        self._alone: deque[int] = deque(maxlen=_KEPT)
+        self._unpaired: deque[int] = deque(maxlen=_KEPT)
         self._newest_ns = None
-        self._vain = 0
+        self._misses = 0
 
     def _is_sent(self, stamp_ns: int) -> bool:
         return self._newest_ns is not None and abs(stamp_ns - self._newest_ns) < _SENT_NS

@@ -30,6 +30,33 @@ JOINTS = """name => {
 }"""
 
 
+_PIXELS = """() => Array.from(document.querySelectorAll("img")).filter(each => each.naturalWidth > 300).map(each => {
+  const canvas = document.createElement("canvas");
+  [canvas.width, canvas.height] = [each.naturalWidth, each.naturalHeight];
+  const context = canvas.getContext("2d");
+  context.drawImage(each, 0, 0);
+  const data = context.getImageData(0, 0, canvas.width, canvas.height).data;
+  let count = 0;
+  for (let k = 0; k < data.length; k += 4) {
+    const [low, high] = [Math.min(data[k], data[k + 1], data[k + 2]), Math.max(data[k], data[k + 1], data[k + 2])];
+    count += CONDITION;
+  }
+  return [count, 4 * count / data.length];
+})"""
+
+
+def pixels_where(condition: str) -> str:
+    """A script that counts pixels of each image on the page that is wider than 300 pixels.
+
+    Args:
+        condition: in JavaScript, on the ``low`` and ``high`` of a pixel's red, green and blue, 0 to 255.
+
+    Returns:
+        Of which ``page.evaluate`` makes a list of (number, share of the image).
+    """
+    return _PIXELS.replace("CONDITION", condition)
+
+
 def need_chromium() -> None:
     """Skip the test where there is no browser."""
     if CHROMIUM is None:

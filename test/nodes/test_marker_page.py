@@ -16,7 +16,7 @@ rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 pytest.importorskip("viser", reason="viser is not installed")
 
-from browser import PATIENCE, PICTURES, Browser, browsing, need_chromium  # noqa: E402
+from browser import PATIENCE, PICTURES, Browser, browsing, need_chromium, pixels_where  # noqa: E402
 from running import RELIABLE, ROOT, Running  # noqa: E402
 
 from body_tracking.core.parameters import check_all  # noqa: E402
@@ -44,17 +44,7 @@ LINES = """() => {
   const points = window.__viserSceneTree?.getState()["/markers/chain/lines"]?.message.props.points;
   return points ? Array.from(new Float32Array(points.buffer, points.byteOffset, points.byteLength / 4)) : null;
 }"""
-COLOURED = """() => Array.from(document.querySelectorAll("img")).filter(each => each.naturalWidth > 300).map(each => {
-  const canvas = document.createElement("canvas");
-  [canvas.width, canvas.height] = [each.naturalWidth, each.naturalHeight];
-  const context = canvas.getContext("2d");
-  context.drawImage(each, 0, 0);
-  const data = context.getImageData(0, 0, canvas.width, canvas.height).data;
-  let count = 0;
-  for (let k = 0; k < data.length; k += 4)
-    count += Math.max(data[k], data[k + 1], data[k + 2]) - Math.min(data[k], data[k + 1], data[k + 2]) > 40;
-  return count;
-})"""
+COLOURED = pixels_where("high - low > 40")
 
 
 def messages(stages: list[Stage]) -> list[dict[str, bytes]]:
@@ -130,7 +120,7 @@ def test_a_browser_shows_balls_points_and_targets(tmp_path: Path) -> None:
 
             def coloured() -> bool:
                 publish()
-                return sum(count > 100 for count in page.evaluate(COLOURED)) == 2
+                return sum(count > 100 for count, _ in page.evaluate(COLOURED)) == 2
 
             browser.until(coloured, "two images with circles in the colours of targets")
             if PICTURES:
