@@ -49,9 +49,10 @@ $(STAMP): setup.py setup.cfg
 	  echo "make: $$python has no venv module; on Debian or Ubuntu: apt install python3-venv" >&2; exit 1; \
 	fi; \
 	[ -x $(BIN)/python ] && $(BIN)/python -m pip --version >/dev/null 2>&1 || "$$python" -m venv --clear $(VENV)
-	@echo "installing into $(VENV) (the first time it takes two or three minutes, and 1.5 GB)"
-	@$(BIN)/python -m pip install -qq --disable-pip-version-check --editable '.[ros,viewer,test,bench]'
+	@echo "installing into $(VENV) (the first time it takes two or three minutes, and 1.6 GB)"
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check --editable '.[ros,viewer,camera,test,bench]'
 	@$(BIN)/body_tracking compile
+	@$(BIN)/body_tracking camera model || echo "make: go on without it: cameras find nobody, and their tests are skipped" >&2
 	@touch $@
 
 demo: $(STAMP) ## play a shipped recording through the real graph; joint angles, a picture and a new recording

@@ -65,6 +65,7 @@ setup(
             "ros-jazzy-common-interfaces==5.3.6",
             "ros-jazzy-rmw-fastrtps-cpp==8.4.3",
         ],
+        "camera": ["ai-edge-litert>=1.2"],
         "viewer": ["viser>=1.1,<2", "trimesh>=3.21.7", "websockets>=14"],
         "test": [
             "pytest>=8",

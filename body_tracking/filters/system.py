@@ -61,6 +61,7 @@ SYSTEM = System(
             "the filter; overrides the parameters file",
             choices=_filters,
             parameter=("skeleton_filter", "filter"),
+            offline=True,
         ),
         Option(
             "lag",
@@ -69,6 +70,7 @@ SYSTEM = System(
             "recording and looking, not for control",
             metavar="S",
             parameter=("skeleton_filter", "lag"),
+            offline=True,
         ),
         Option("filter_input", "", parameter=("skeleton_filter", "input"), hidden=True),
     ),

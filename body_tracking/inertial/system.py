@@ -45,6 +45,7 @@ SYSTEM = System(
             "SEGMENT[:NAME]",
             parameter=("imu_skeleton", "segments"),
             example=graph.EXAMPLE_IMUS,
+            offline=True,
         ),
     ),
     topics=(

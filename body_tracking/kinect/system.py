@@ -113,6 +113,7 @@ SYSTEM = System(
             graph.DEFAULT_SENSORS,
             "the sensors, the reference first, or none (default: those in the bag, else kinect1,kinect2)",
             "A,B",
+            offline=True,
         ),
         Option("computed", (), hidden=True),
         Option("external", False, "start no sensor nodes: other processes publish /<sensor>/skeleton"),
@@ -128,6 +129,7 @@ SYSTEM = System(
             "YAML file of the calibration: loaded if it exists, saved when the result changes",
             "FILE",
             path=True,
+            offline=True,
         ),
         Option("reliable", False, "transport skeletons reliably: nothing is lost, but delays may grow"),
         Option(
@@ -136,6 +138,7 @@ SYSTEM = System(
             "whom to track: the nearest person, the one seen first, or all (default: nearest)",
             choices=_subjects,
             parameter=("skeleton_filter", "subject"),
+            offline=True,
         ),
         Option(
             "people",
@@ -143,6 +146,7 @@ SYSTEM = System(
             "with --subject all: the largest number of people (default: 6)",
             "N",
             parameter=("skeleton_filter", "people"),
+            offline=True,
         ),
     ),
     topics=(

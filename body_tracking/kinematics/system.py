@@ -52,6 +52,7 @@ SYSTEM = System(
             "convention of the joint angles; overrides the parameters file",
             choices=_conventions,
             parameter=("joint_angles", "convention"),
+            offline=True,
         ),
         Option("angles_input", "", parameter=("joint_angles", "input"), hidden=True),
     ),

@@ -104,6 +104,8 @@ SYSTEM = System(
             "FOLDER",
             path=True,
             example="setup",
+            offline=True,
+            source=True,
         ),
         Option(
             "marker_images",
@@ -120,6 +122,7 @@ SYSTEM = System(
             f"{' (default) or '.join(FOREIGN_TYPES)}",
             "TOPIC[:TYPE]",
             example="/mocap/points",
+            offline=True,
         ),
     ),
     topics=(

@@ -66,6 +66,20 @@ class Cloud:
     pixels: IntArray
 
 
+def check_size(depth: NDArray[Any], camera: Camera) -> None:
+    """Check that an image has the size for which a camera is calibrated.
+
+    Raises:
+        DepthError: it has not.
+    """
+    height, width = depth.shape
+    if (width, height) != (camera.width, camera.height):
+        raise DepthError(
+            f"depth image of {width} x {height} pixels, but camera_info of {camera.frame_id} says "
+            f"{camera.width} x {camera.height}"
+        )
+
+
 class DepthCamera:
     """A depth camera with the viewing direction of each of its pixels.
 
@@ -88,12 +102,7 @@ class DepthCamera:
         Raises:
             DepthError: it is not.
         """
-        height, width = depth.shape
-        if (width, height) != (self.camera.width, self.camera.height):
-            raise DepthError(
-                f"depth image of {width} x {height} pixels, but camera_info of {self.camera.frame_id} says "
-                f"{self.camera.width} x {self.camera.height}"
-            )
+        check_size(depth, self.camera)
 
     def points(self, depth: SingleArray) -> SingleArray:
         """(height, width, 3) points of all pixels, metres; NaN where nothing was measured.

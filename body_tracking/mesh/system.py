@@ -74,6 +74,8 @@ SYSTEM = System(
             "published as those of a sensor SENSOR_mesh",
             "SENSOR",
             example=("kinect1",),
+            offline=True,
+            source=True,
         ),
         Option(
             "person",
@@ -82,6 +84,7 @@ SYSTEM = System(
             "not exist",
             "FILE",
             path=True,
+            offline=True,
         ),
     ),
     topics=(

@@ -20,6 +20,7 @@ MAX_PIXELS: Final = 1 << 26
 
 _COLOURS: Final = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4}
 """Channels of colour encodings."""
+_GREY: Final = ("mono8", "8UC1")
 
 
 def to_mono(message: Any) -> tuple[int, NDArray[Any], bool]:
@@ -37,6 +38,22 @@ def to_mono(message: Any) -> tuple[int, NDArray[Any], bool]:
     rows = _rows(message, channels)
     total = rows.reshape(len(rows), -1, channels)[..., :3].sum(axis=2, dtype=np.uint16)
     return to_nanoseconds(message.header.stamp), ((total + 1) // 3).astype(np.uint8), True
+
+
+def to_rgb(message: Any) -> tuple[int, str, NDArray[np.uint8]]:
+    """Stamp in nanoseconds, frame, and (height, width, 3) red, green, blue of an image in colour, or grey in three.
+
+    Raises:
+        MessageError: another encoding, sizes that contradict each other.
+    """
+    encoding = str(message.encoding)
+    channels = _COLOURS.get(encoding, 1 if encoding in _GREY else 0)
+    if not channels:
+        raise MessageError(f"encoding {encoding!r}, expected one of {', '.join((*_COLOURS, *_GREY))}")
+    rows = _rows(message, channels)
+    pixels = rows.reshape(len(rows), -1, channels)
+    order = [0, 0, 0] if channels == 1 else [2, 1, 0] if encoding.startswith("bgr") else [0, 1, 2]
+    return to_nanoseconds(message.header.stamp), str(message.header.frame_id), np.ascontiguousarray(pixels[..., order])
 
 
 def _rows(message: Any, pixel_bytes: int) -> NDArray[np.uint8]:
@@ -67,8 +84,11 @@ def image_to_array(message: Any, encodings: Mapping[str, str] = BRIGHTNESS) -> t
 
 
 def array_to_image(pixels: NDArray[Any], stamp_ns: int, frame_id: str, types: MessageTypes, encoding: str = "") -> Any:
-    """The message of (height, width) pixels; ``mono8`` or ``mono16`` without an encoding."""
-    height, width = pixels.shape
+    """The message of (height, width) or (height, width, channels) pixels.
+
+    Without an encoding ``mono8`` or ``mono16``.
+    """
+    height, width = pixels.shape[:2]
     rows = np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder("<"))
     return types.make(
         IMAGE,
@@ -77,6 +97,6 @@ def array_to_image(pixels: NDArray[Any], stamp_ns: int, frame_id: str, types: Me
         width=width,
         encoding=encoding or ("mono8" if pixels.dtype.itemsize == 1 else "mono16"),
         is_bigendian=0,
-        step=width * pixels.dtype.itemsize,
+        step=rows.nbytes // height,
         data=types.octets(rows.tobytes()),
     )

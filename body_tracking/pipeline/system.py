@@ -51,6 +51,8 @@ class Option:
         path: it names a file or a folder.
         parameter: the equivalent (node, parameter) of a parameters file, which the option overrides.
         hidden: no command has it, only the parameters file.
+        offline: ``replay`` has it, too.
+        source: with a value, the graph has sensors of its own beside those of the option ``sensors``.
         example: a value with which a graph has the nodes that depend on it, for lists of all nodes.
     """
 
@@ -62,6 +64,8 @@ class Option:
     path: bool = False
     parameter: tuple[str, str] | None = None
     hidden: bool = False
+    offline: bool = False
+    source: bool = False
     example: Value | None = None
 
 

@@ -34,6 +34,7 @@ from body_tracking.recording.progress import Progress
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader
 from body_tracking.systems import (
+    OPTIONS,
     STAGES,
     add_options,
     all_nodes_for,
@@ -86,8 +87,7 @@ class ReplaySettings:
     def options(self) -> Options:
         """Options of the graph."""
         given: dict[str, Value] = {
-            "sensors": self.sensors
-            or (() if self.more.get("marker_setup") or self.more.get("depth") else graph.DEFAULT_SENSORS),
+            "sensors": self.sensors or (() if self.other_sources else graph.DEFAULT_SENSORS),
             "filter": self.filter_name,
             "convention": self.convention,
             "imus": self.imus,
@@ -95,6 +95,11 @@ class ReplaySettings:
             "external": True,
         }
         return options_of(**given, **self.more)
+
+    @property
+    def other_sources(self) -> bool:
+        """Whether the graph has sensors beside those of the option ``sensors``."""
+        return any(OPTIONS[name].source and bool(value) for name, value in self.more.items())
 
     def values(self) -> dict[str, dict[str, Value]]:
         """All parameters of each stage, by its name.
@@ -263,12 +268,12 @@ def _without(settings: ReplaySettings, bag: BagReader) -> bool:
         ReplayError: none are wanted, and nothing else is.
     """
     if settings.sensors == (graph.NO_SENSORS,):
-        if not (settings.more.get("marker_setup") or settings.more.get("depth")):
-            raise ReplayError(f"{bag.path}: sensors none, and neither a marker setup nor a depth camera")
+        if not settings.other_sources:
+            raise ReplayError(f"{bag.path}: sensors none, and no images or markers are asked for")
         return True
-    more = settings.more
-    other = more.get("depth") or (more.get("marker_setup") and not graph.sensors_among(bag.topics))
-    return bool(other) and not settings.sensors
+    if settings.sensors or not settings.other_sources:
+        return False
+    return bool(settings.options()["computed"]) or not graph.sensors_among(bag.topics)
 
 
 def _listed(counters: Mapping[str, int]) -> str:
@@ -276,6 +281,10 @@ def _listed(counters: Mapping[str, int]) -> str:
 
 
 # --- the command
+
+_OFFLINE_OPTIONS: Final = tuple(option.name for option in OPTIONS.values() if option.offline)
+_NAMED: Final = ("sensors", "filter", "convention", "calibration", "imus", "params_file", "model_covariance")
+"""Those that :class:`ReplaySettings` has by name."""
 
 
 def settings_from(args: argparse.Namespace) -> ReplaySettings:
@@ -295,17 +304,7 @@ def settings_from(args: argparse.Namespace) -> ReplaySettings:
     sensors: tuple[str, ...] = ()
     if args.sensors:
         sensors = tuple(each for each in options["sensors"] if each not in options["computed"]) or (graph.NO_SENSORS,)
-    more = (
-        "filter_input",
-        "angles_input",
-        "marker_setup",
-        "marker_points",
-        "depth",
-        "person",
-        "subject",
-        "people",
-        "lag",
-    )
+    more = ("filter_input", "angles_input", *(name for name in _OFFLINE_OPTIONS if name not in _NAMED))
     return ReplaySettings(
         sensors,
         args.reference or "",
@@ -338,13 +337,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     command.add_argument(
         "--body", default=graph.DEFAULT_BODY, help="id of the person, if only one is tracked (default: %(default)s)"
     )
-    names = ("sensors", "filter", "convention", "calibration", "imus", "subject", "people", "lag", "params_file")
-    cameras = ("marker_setup", "marker_points", "depth", "person")
     add_options(
         command,
-        *names,
-        *cameras,
-        "model_covariance",
+        *_OFFLINE_OPTIONS,
         filter=f"default: {DEFAULT_FILTER}",
         convention="convention of the joint angles (default: that of the filter)",
         sensors="the sensors, the reference first; none: no skeletons, markers or depth alone (default: all in the "

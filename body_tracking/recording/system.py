@@ -65,6 +65,7 @@ SYSTEM = System(
             False,
             "also record /filtered/model_covariance, with ekf most of a recording; replay can compute it again",
             parameter=("bag_recorder", "model_covariance"),
+            offline=True,
         ),
     ),
     topics=(TopicSpec(graph.CLOCK_TOPIC, CLOCK, RELIABLE, "bag_player", "the bag's time, for `use_sim_time`"),),

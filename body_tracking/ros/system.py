@@ -14,7 +14,7 @@ SYSTEM = System(
         Option(
             "namespace", "/", "namespace of all nodes and topics, for a second graph in the same ROS domain", "NAME"
         ),
-        Option("params_file", "", "ROS parameters file; see config/", "FILE", path=True),
+        Option("params_file", "", "ROS parameters file; see config/", "FILE", path=True, offline=True),
     ),
     topics=(
         TopicSpec(

@@ -116,7 +116,7 @@ class DepthScene:
         count = int(min(self.movement.duration / self.speed, np.inf if stop is None else stop) * RATE)
         numbers = np.arange(round(start * RATE), count, step)
         course = self.course(numbers / RATE)
-        view, floor, room = DepthCamera(self.camera), self._floor(), render(*self._room(), self.camera).depth
+        view, floor, room = DepthCamera(self.camera), self._floor(), render(*self.room(), self.camera).depth
         empty = measured(room, view, self._rng(-1), self.errors, floor=floor)
         rotation, translation = self.pose.rotation, self.pose.translation
         for index, number in enumerate(numbers.tolist()):
@@ -139,8 +139,11 @@ class DepthScene:
     def _floor(self) -> Floor:
         return Floor(self.pose.rotation.T @ [0.0, 0.0, 1.0], _HEIGHT)
 
-    def _room(self) -> tuple[FloatArray, NDArray[np.int32]]:
-        """Floor, wall and table, in the optical frame, of small faces, as lens distortion bends their edges."""
+    def room(self) -> tuple[FloatArray, NDArray[np.int32]]:
+        """Vertices (n, 3) of floor, wall and table, in the optical frame, and faces (m, 3), the floor's first.
+
+        The faces are small, as lens distortion bends their edges.
+        """
         quads = [
             _quad((0.4, -4.0, 0.0), (_WALL - 0.4, 0.0, 0.0), (0.0, 8.0, 0.0)),
             _quad((_WALL, -4.0, 0.0), (0.0, 8.0, 0.0), (0.0, 0.0, 3.5)),

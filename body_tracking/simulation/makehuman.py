@@ -52,6 +52,10 @@ GROUPS: Final = {"body": "skin", "helper-tights": "tights", "helper-skirt": "ski
 """Groups of the base mesh, and their names here."""
 
 
+SKIN, HAIR, CLOTH = range(3)
+"""Materials of a body's faces."""
+
+
 class MakeHumanError(BodyTrackingError):
     """MakeHuman's data are absent, or not as expected."""
 
@@ -205,7 +209,9 @@ class MakeHuman:
     def _dressed(self, vertices: FloatArray, sex: str, clothes: tuple[str, ...], rng: np.random.Generator) -> Body:
         """The clothes stand off the skin by 4 to 20 mm, in patches of a decimetre."""
         vertices = vertices - [0.0, 0.0, vertices[: self._skin, 2].min()]
-        shown = np.concatenate([self.faces["skin"], self.faces["hair"], *(self.faces[name] for name in clothes)])
+        groups = [self.faces[name] for name in ("skin", "hair", *clothes)]
+        shown = np.concatenate(groups)
+        materials = np.repeat(np.minimum(np.arange(len(groups)), CLOTH), [len(each) for each in groups])
         dark = np.zeros(len(vertices), np.bool_)
         for name in clothes:
             faces = self.faces[name]
@@ -213,7 +219,7 @@ class MakeHuman:
             waves = rng.normal(scale=2.0 * np.pi / 0.25, size=(12, 3))
             folds = np.sin(vertices[used] @ waves.T + rng.uniform(0.0, 2.0 * np.pi, 12)).sum(axis=1) / np.sqrt(6.0)
             off = np.clip(0.010 + 0.005 * folds, 0.002, 0.025)
-            vertices[used] += off[:, None] * _normals(vertices, faces)[used]
+            vertices[used] += off[:, None] * normals(vertices, faces)[used]
             dark[used] = rng.random() < 0.4
         heads = np.array([self._place(self._bones[name]["head"], vertices) for name in self.rig.names])
         knuckles = {
@@ -221,7 +227,7 @@ class MakeHuman:
             - self._centre(f"joint-{side}-finger-5-1", vertices)
             for side in ("l", "r")
         }
-        return Body(sex, vertices, shown, dark, self.rig, heads, (knuckles["l"], knuckles["r"]))
+        return Body(sex, vertices, shown, materials, dark, self.rig, heads, (knuckles["l"], knuckles["r"]))
 
     def _centre(self, cube: str, vertices: FloatArray) -> FloatArray:
         return np.asarray(vertices[self._cubes[cube]].mean(axis=0))
@@ -243,6 +249,7 @@ class Body:
         sex: ``female`` or ``male``.
         vertices: (N, 3) metres, on the floor z = 0.
         faces: (F, 3) of skin, hair and clothes.
+        materials: (F,) :data:`SKIN`, :data:`HAIR` or :data:`CLOTH`.
         dark: (N,) vertices of dark cloth.
         rig: of the vertices.
         heads: (B, 3) the joints at which the bones start.
@@ -252,6 +259,7 @@ class Body:
     sex: str
     vertices: FloatArray
     faces: IntArray
+    materials: IntArray
     dark: BoolArray
     rig: Rig
     heads: FloatArray
@@ -302,7 +310,7 @@ def _faces(lines: list[str]) -> dict[str, NDArray[np.intp]]:
     return {name: np.array(each, dtype=np.intp).reshape(-1, 3) for name, each in found.items()}
 
 
-def _normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
+def normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
     """(N, 3) unit normals of the vertices of these faces, weighted by area; zero for others."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     normals = np.zeros_like(vertices)

@@ -1,0 +1,207 @@
+"""From landmarks in a colour image and the depth image behind them to the joints of a body in three dimensions.
+
+A depth camera measures the skin or the clothes; the centre of a joint lies behind that along the line of sight. Where
+something else hides a joint, the depth at its pixel is that of what is in front: it contradicts the depth which the
+statistical model of the landmarks expects there, and the joint is then inferred from this expectation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from body_tracking.camera.pose_model import Landmark, Landmarks
+from body_tracking.core.camera import Camera
+from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray, Joint, SingleArray, Skeleton, TrackingState
+from body_tracking.mesh.depth import axial_noise
+
+_BODY_SIDE: Final = 2.2
+"""Metres: side of the region around an upright person, which the landmarks' errors are proportional to."""
+_ACROSS: Final = 0.022
+"""Metres: standard deviation of a landmark across the line of sight, per axis, in a region of :data:`_BODY_SIDE`: 95 %
+of the landmarks are within a fifth of the trunk's length, as published for this network (Grishchenko et al. 2022,
+arXiv:2206.11678, table 2), most of them much nearer."""
+_HIDDEN: Final = 3.0
+"""Factor on it for a landmark that the network guesses."""
+_ALONG: Final = 0.025
+"""Metres: standard deviation of the depth of a joint's centre behind the surface: people and clothes differ."""
+_GUESSED_ALONG: Final = 0.12
+"""The same where the depth is only expected."""
+_WINDOW: Final = 0.03
+"""Metres to each side of a landmark in which its surface is looked for."""
+_EXPECTED: Final = 0.25
+"""Metres by which a joint's surface may be off the depth that is expected."""
+_LEAST_PIXELS: Final = 4
+_SEEN: Final = 0.5
+"""Least probability that a landmark is visible, or in the image."""
+_FLAT_POINTS: Final = 200
+_FLAT: Final = 0.005
+"""Metres: a body whose surface is off a plane by less than this and the camera's noise, RMS, is a picture of one; the
+flattest of simulated people, who stand straight before the camera, are off by 10 mm."""
+
+# The landmarks whose mean each joint is, and how far its centre is behind the surface in metres: half of the segment's
+# depth there, of adults in clothes.
+_MADE_OF: Final[dict[Joint, tuple[tuple[Landmark, ...], float]]] = {
+    Joint.HEAD: ((Landmark.EAR_LEFT, Landmark.EAR_RIGHT), 0.08),
+    **{
+        Joint[f"{joint}_{side}"]: (tuple(Landmark[f"{each}_{side}"] for each in names), behind)
+        for side in ("LEFT", "RIGHT")
+        for joint, names, behind in (
+            ("SHOULDER", ("SHOULDER",), 0.06),
+            ("ELBOW", ("ELBOW",), 0.04),
+            ("WRIST", ("WRIST",), 0.03),
+            ("HAND", ("WRIST", "INDEX_FINGER", "LITTLE_FINGER"), 0.02),
+            ("HIP", ("HIP",), 0.10),
+            ("KNEE", ("KNEE",), 0.06),
+            ("ANKLE", ("ANKLE",), 0.04),
+            ("FOOT", ("TOES",), 0.02),
+        )
+    },
+}
+_JOINTS: IntArray = np.array(list(_MADE_OF), dtype=np.intp)
+_WEIGHTS: FloatArray = np.zeros((len(_MADE_OF), len(Landmark)))
+for _row, (_names, _) in enumerate(_MADE_OF.values()):
+    _WEIGHTS[_row, list(_names)] = 1.0 / len(_names)
+_BEHIND: FloatArray = np.array([behind for _, behind in _MADE_OF.values()])
+
+# Joints of the trunk that no landmark is at, as weights of the middles of the shoulders and of the hips.
+_TRUNK: Final[dict[Joint, tuple[float, float]]] = {
+    Joint.SPINE_BASE: (0.0, 1.0),
+    Joint.SPINE_MID: (0.578, 0.422),
+    Joint.SPINE_SHOULDER: (1.0, 0.0),
+    Joint.NECK: (1.12, -0.12),
+}
+_SHOULDERS = (Joint.SHOULDER_LEFT, Joint.SHOULDER_RIGHT)
+_HIPS = (Joint.HIP_LEFT, Joint.HIP_RIGHT)
+_TORSO: IntArray = np.array(
+    [Landmark.SHOULDER_LEFT, Landmark.SHOULDER_RIGHT, Landmark.HIP_RIGHT, Landmark.HIP_LEFT], dtype=np.intp
+)
+_SPINE: Final = 0.08
+"""Metres: width of what is taken for the trunk in any case."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lifted:
+    """A body in three dimensions.
+
+    Attributes:
+        positions: (25, 3) metres in the optical frame of the colour camera; NaN where unknown.
+        states: (25,) of :class:`~body_tracking.core.skeleton.TrackingState`.
+        covariances: (25, 3, 3) square metres; NaN where unknown.
+    """
+
+    positions: FloatArray
+    states: NDArray[np.uint8]
+    covariances: FloatArray
+
+    def skeleton(self, stamp_ns: int, frame_id: str, body: int = 0) -> Skeleton:
+        """The joints as a sensor's skeleton."""
+        return Skeleton(stamp_ns, frame_id, self.positions, self.states, body, covariances=self.covariances)
+
+
+def lift(found: Landmarks, depth: SingleArray, camera: Camera) -> Lifted | None:
+    """The joints of one person.
+
+    Args:
+        found: landmarks in the image of ``camera``.
+        depth: (height, width) metres at the same pixels, 0 where missing.
+        camera: intrinsics of both.
+
+    Returns:
+        None where the depth image shows nothing at the trunk.
+    """
+    trunk = trunk_depth(found, depth)
+    if trunk is None:
+        return None
+    focal = float(camera.matrix[0, 0])
+    pixels, world = _WEIGHTS @ found.pixels, _WEIGHTS @ found.world
+    visible = np.min(np.where(_WEIGHTS > 0.0, found.visible, 1.0), axis=1)
+    present = np.min(np.where(_WEIGHTS > 0.0, found.present, 1.0), axis=1) > _SEEN
+    present &= camera.contains(pixels)
+    expected = trunk + world[:, 2] - found.world[_TORSO, 2].mean()
+    surface, spread = np.full(len(_JOINTS), np.nan), np.zeros(len(_JOINTS))
+    for k in np.flatnonzero(present & (expected > _WINDOW)):
+        surface[k], spread[k] = _surface_near(depth, pixels[k], float(expected[k]), _WINDOW * focal / expected[k])
+    # where the network guesses, what is measured may be in front of the joint
+    seen = np.isfinite(surface) & (visible > _SEEN)
+    rays = np.concatenate([camera.undistort(pixels), np.ones((len(pixels), 1))], axis=1)
+    positions = rays * (np.where(seen, surface, expected) + _BEHIND)[:, None]
+    scale = found.region.side * trunk / focal / _BODY_SIDE
+    across = _ACROSS * scale * np.where(seen, 1.0, _HIDDEN)
+    along = np.where(seen, np.hypot(_ALONG, spread), _GUESSED_ALONG)
+    unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    outer = unit[:, :, None] * unit[:, None, :]
+    covariances = (across**2)[:, None, None] * (np.eye(3) - outer) + (along**2)[:, None, None] * outer
+    return _whole(positions, covariances, seen, present & np.isfinite(positions).all(axis=1))
+
+
+def trunk_depth(found: Landmarks, depth: SingleArray) -> float | None:
+    """The median depth of a person's trunk, metres; None where nothing is measured there."""
+    measured = depth[_trunk_mask(found, depth.shape)]
+    measured = measured[measured > 0.0]
+    return float(np.median(measured)) if len(measured) >= _LEAST_PIXELS else None
+
+
+def is_flat(found: Landmarks, depth: SingleArray, camera: Camera) -> bool:
+    """Whether the person is a picture: the surface of trunk and joints lies in a plane."""
+    mask = _trunk_mask(found, depth.shape)
+    inside = camera.contains(found.pixels) & (found.visible > _SEEN)
+    columns, rows = np.round(found.pixels[inside]).astype(np.intp).T
+    mask[rows, columns] = True
+    rows, columns = np.nonzero(mask & (depth > 0.0))
+    chosen = np.linspace(0, len(rows) - 1, min(len(rows), _FLAT_POINTS)).astype(np.intp)
+    rows, columns = rows[chosen], columns[chosen]
+    z = depth[rows, columns].astype(np.float64)
+    if len(z) < _FLAT_POINTS // 2:
+        return False
+    flat = (np.column_stack([columns, rows]) - camera.matrix[:2, 2]) / camera.matrix[[0, 1], [0, 1]]
+    points = np.column_stack([flat * z[:, None], z])
+    off = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(z))
+    return bool(off < _FLAT + float(axial_noise(z.mean())))
+
+
+def _trunk_mask(found: Landmarks, shape: tuple[int, ...]) -> BoolArray:
+    """Pixels of the trunk: between shoulders and hips, and about the spine where it is seen from the side."""
+    corners = found.pixels[_TORSO]
+    middle = corners.mean(axis=0)
+    top, bottom = corners[:2].mean(axis=0), corners[2:].mean(axis=0)
+    mask = np.zeros(shape, np.uint8)
+    inner = np.round(middle + 0.8 * (corners - middle)).astype(np.int32)
+    cv2.fillConvexPoly(mask, cv2.convexHull(inner), 1)
+    ends = [tuple(np.round(middle + 0.7 * (end - middle)).astype(int).tolist()) for end in (top, bottom)]
+    cv2.line(mask, ends[0], ends[1], 1, max(1, round(_SPINE * found.region.side / _BODY_SIDE)))
+    return mask.astype(np.bool_)
+
+
+def _surface_near(depth: SingleArray, pixel: FloatArray, expected: float, radius: float) -> tuple[float, float]:
+    """Depth of the surface at a pixel and its scatter, metres; NaN where none is near the expected depth."""
+    (column, row), reach = np.round(pixel).astype(int), max(1, round(radius))
+    window = depth[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1]
+    there = window[np.abs(window - expected) < _EXPECTED].astype(np.float64)
+    if len(there) < _LEAST_PIXELS:
+        return np.nan, 0.0
+    surface = float(np.median(there))
+    return surface, 1.4826 * float(np.median(np.abs(there - surface)))
+
+
+def _whole(positions: FloatArray, covariances: FloatArray, seen: BoolArray, known: BoolArray) -> Lifted:
+    """All joints of the set from those that have landmarks."""
+    points, spread = np.full((len(Joint), 3), np.nan), np.full((len(Joint), 3, 3), np.nan)
+    states = np.full(len(Joint), TrackingState.NOT_TRACKED, np.uint8)
+    made = _JOINTS[known]
+    points[made], spread[made] = positions[known], covariances[known]
+    states[made] = np.where(seen[known], TrackingState.TRACKED, TrackingState.INFERRED)
+    for joint, (of_shoulders, of_hips) in _TRUNK.items():
+        parts = [(of_shoulders / 2.0, each) for each in _SHOULDERS] + [(of_hips / 2.0, each) for each in _HIPS]
+        used = [(weight, each) for weight, each in parts if weight]
+        if any(states[each] == TrackingState.NOT_TRACKED for _, each in used):
+            continue
+        points[joint] = sum(weight * points[each] for weight, each in used)
+        # the errors of the trunk's landmarks are alike
+        spread[joint] = np.mean([spread[each] for _, each in used], axis=0)
+        states[joint] = min(states[each] for _, each in used)
+    return Lifted(points, states, spread)

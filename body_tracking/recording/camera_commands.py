@@ -1,0 +1,113 @@
+"""``body_tracking camera``: the networks that find people in images, and pictures of what they find."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from body_tracking.camera import model_files
+from body_tracking.camera.pose_model import Landmark, Landmarks, PoseModel
+from body_tracking.core.errors import BodyTrackingError
+
+_BONES: Final = (
+    *(
+        (f"{one}_{side}", f"{other}_{side}")
+        for side in ("LEFT", "RIGHT")
+        for one, other in (
+            ("SHOULDER", "ELBOW"),
+            ("ELBOW", "WRIST"),
+            ("WRIST", "INDEX_FINGER"),
+            ("SHOULDER", "HIP"),
+            ("HIP", "KNEE"),
+            ("KNEE", "ANKLE"),
+            ("ANKLE", "TOES"),
+        )
+    ),
+    ("SHOULDER_LEFT", "SHOULDER_RIGHT"),
+    ("HIP_LEFT", "HIP_RIGHT"),
+)
+_LEFT, _RIGHT, _GUESSED = (255, 140, 0), (0, 170, 255), (160, 160, 160)
+_ROUNDS: Final = 3
+"""Searches of a region in a single image, each from where the last one ended, as in a video."""
+
+
+class CameraCommandError(BodyTrackingError):
+    """An image cannot be read or written."""
+
+
+def draw(image: NDArray[np.uint8], found: Landmarks) -> None:
+    """Draw a person into an image (height, width, 3) of red, green, blue: left orange, right blue, guessed grey."""
+    thick = max(1, round(found.region.side / 250))
+
+    def place(landmark: Landmark) -> tuple[int, int]:
+        x, y = np.round(found.pixels[landmark]).astype(int).tolist()
+        return x, y
+
+    def colour(*landmarks: Landmark) -> tuple[int, int, int]:
+        if min(found.visible[each] for each in landmarks) < 0.5:
+            return _GUESSED
+        return _LEFT if landmarks[0].name.endswith("LEFT") else _RIGHT
+
+    for names in _BONES:
+        one, other = (Landmark[name] for name in names)
+        if min(found.present[one], found.present[other]) > 0.5:
+            cv2.line(image, place(one), place(other), colour(one, other), thick, cv2.LINE_AA)
+    for landmark in Landmark:
+        if found.present[landmark] > 0.5:
+            cv2.circle(image, place(landmark), thick + 1, colour(landmark), -1, cv2.LINE_AA)
+
+
+def people_in(image: NDArray[np.uint8], model: PoseModel, people: int) -> list[Landmarks]:
+    """The people in a single image (height, width, 3) of red, green, blue."""
+    found = []
+    for detected in model.detect(image)[:people]:
+        region = detected
+        for _ in range(_ROUNDS):
+            landmarks = model.find(image, region)
+            region = landmarks.next_region
+        if landmarks.presence > 0.5:
+            found.append(landmarks)
+    return found
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """``body_tracking camera``."""
+    command = subparsers.add_parser("camera", description=__doc__)
+    actions = command.add_subparsers(metavar="ACTION", required=True)
+    model = actions.add_parser("model", help="fetch the networks (MediaPipe's, Apache licence 2.0; 35 MB by pip)")
+    model.add_argument("folder", type=Path, nargs="?", help="where to (default: the user's cache)")
+    model.set_defaults(run=_model)
+    show = actions.add_parser("show", help="draw the people in an image")
+    show.add_argument("image", type=Path, help="PNG or JPEG file")
+    show.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="picture to write")
+    show.add_argument("--people", type=int, default=6, metavar="N", help="the largest number of people (6)")
+    show.add_argument("--pose-model", type=Path, metavar="FOLDER", help="folder of the networks")
+    show.set_defaults(run=_show)
+
+
+def _model(args: argparse.Namespace) -> int:
+    folder = args.folder or model_files.default_folder()
+    print("fetching MediaPipe's networks by pip (35 MB)")
+    model_files.fetch(folder)
+    print(f"networks: {folder}")
+    return 0
+
+
+def _show(args: argparse.Namespace) -> int:
+    model = PoseModel(args.pose_model or model_files.default_folder())
+    pixels: Any = cv2.imread(str(args.image), cv2.IMREAD_COLOR)
+    if pixels is None:
+        raise CameraCommandError(f"{args.image}: no image")
+    image = np.ascontiguousarray(pixels[..., ::-1])
+    found = people_in(image, model, max(args.people, 1))
+    for each in found:
+        draw(image, each)
+    if not cv2.imwrite(str(args.output), image[..., ::-1]):
+        raise CameraCommandError(f"{args.output}: cannot be written")
+    print(f"people: {len(found)}\npicture: {args.output}")
+    return 0
