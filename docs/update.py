@@ -49,6 +49,7 @@ GROUPS = {
         "rigid_body_tracker",
     ),
     "Depth cameras": ("mesh_tracker",),
+    "Colour-and-depth cameras": ("camera_skeleton",),
     "Calibration and fusion": ("calibration", "fusion"),
     "Recordings": ("bag_player", "bag_recorder"),
     "Views": ("body_markers", "viewer"),

@@ -41,6 +41,7 @@ from body_tracking.simulation.layouts import around
 from body_tracking.simulation.scene import Setup, lanes, simulate
 from draws import ALL
 from excerpts import beginning
+from pose_networks import MISSING
 
 pytest.importorskip("rclpy", reason="ROS is not installed")
 
@@ -52,6 +53,8 @@ MARKERS, SETUP = "markers_arm", ROOT / "config" / "marker_setup"
 """The recording of image pairs, and what tracks the markers in it."""
 MESH = "mesh_reaching"
 """The recording of depth images."""
+CAMERA = "camera_reaching"
+"""The recording of colour and depth images."""
 SMOOTHED = "wave with a lag"
 SAME = 1e-4
 """Metres, radians and the like by which live and offline may differ: far less than anything is known to. They are equal
@@ -195,7 +198,8 @@ CASES = [
     *((SMOOTHED, each) for each in ("ekf", "lkf_constant_velocity")),
     (MARKERS, ""),
     (MESH, ""),
-    *((bag.name, each) for bag in sorted(BAGS.iterdir()) if bag.name != MARKERS for each in FILTERS),
+    *((CAMERA, "") for _ in range(not MISSING)),
+    *((bag.name, each) for bag in sorted(BAGS.iterdir()) if bag.name not in (MARKERS, CAMERA) for each in FILTERS),
 ]
 
 
@@ -214,6 +218,9 @@ def played(tmp_path_factory: pytest.TempPathFactory, wave: Path) -> Callable[[st
         elif name == MESH and not filter_name:
             bag = beginning(bag, folder / "excerpt", 1.5)
             arguments = ("--depth", "kinect1", "--params-file", parameters(folder))
+        elif name == CAMERA:
+            bag = beginning(bag, folder / "excerpt", 2.0)
+            arguments = ("--camera", "camera1", "--compressed", "colour", "--params-file", parameters(folder))
         else:
             arguments = ("--filter", filter_name, "--params-file", parameters(folder))
             arguments += ("--lag", "0.15") if name == SMOOTHED else ()

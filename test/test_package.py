@@ -38,7 +38,7 @@ LIBRARIES = {
     "zstandard": ("zstandard", None),
     "rosbags": ("rosbags", None),
 }
-EXTRAS = {"viser": "viewer", "trimesh": "viewer", "websockets": "viewer"}
+EXTRAS = {"ai_edge_litert": "camera", "viser": "viewer", "trimesh": "viewer", "websockets": "viewer"}
 """Import name -> extra; who imports these says what to install where they are absent."""
 
 

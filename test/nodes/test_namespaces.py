@@ -20,6 +20,7 @@ from body_tracking.core import names  # noqa: E402
 from body_tracking.pipeline import graph  # noqa: E402
 from body_tracking.recording.rosbag2 import BagReader  # noqa: E402
 from domains import domain  # noqa: E402
+from pose_networks import startable  # noqa: E402
 
 MARKER_NODES = (
     "marker_cameras",
@@ -36,6 +37,7 @@ NEEDED: dict[str, dict[str, object]] = {
     "robot_commands": {"mapping": ROOT / "config" / "robots" / "iiwa7.yaml"},
     "bag_player": {"bag": BAG},
     "mesh_tracker": {"depth": "[kinect1]"},
+    "camera_skeleton": {"cameras": "[camera1]"},
     "bag_recorder": {"start_recording": False},
     "viewer": {"port": 0},
     **{name: {"setup": ROOT / "config" / "marker_setup"} for name in MARKER_NODES},
@@ -43,7 +45,7 @@ NEEDED: dict[str, dict[str, object]] = {
 """Parameters without which an executable does not start, or has fewer topics."""
 
 
-@pytest.mark.parametrize("executable", systems.EXECUTABLES)
+@pytest.mark.parametrize("executable", startable(systems.EXECUTABLES))
 def test_every_name_of_a_node_is_in_its_namespace(executable: str) -> None:
     given = {"use_sim_time": True, **NEEDED.get(executable, {})}
     parameters = [word for name, value in given.items() for word in ("-p", f"{name}:={value}")]

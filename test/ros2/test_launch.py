@@ -11,6 +11,8 @@ from body_tracking.core.names import WHOLE_DOMAIN
 from body_tracking.pipeline import graph
 from body_tracking.recording.rosbag2 import BagReader
 from draws import some
+from excerpts import beginning
+from pose_networks import MISSING, REASON
 
 ANGLES = graph.joint_states_topic("body1")
 SOON = 180.0
@@ -57,6 +59,16 @@ def test_a_rig_in_a_namespace_keeps_its_topics_there_and_ends_with_its_bag(tools
     assert "Traceback" not in launch.text() and "[ERROR]" not in launch.text()
     with BagReader(tools.folder / "live") as bag:
         assert bag.whole and f"/lab{ANGLES}" in bag.topics
+
+
+@pytest.mark.skipif(bool(MISSING), reason=REASON)
+def test_colour_and_depth_cameras_have_a_launch_of_their_own(tools: Tools) -> None:
+    angles = tools.bench.collect(JointState, ANGLES)
+    bag = beginning(tools.share / "bags" / "camera_reaching", tools.folder / "excerpt", 1.5)
+    launch = tools.launch(f"bag:={bag}", "driver:=plain", "compressed:=colour", file="cameras.launch.py")
+    assert tools.bench.until(lambda: angles, SOON), launch.text()
+    assert launch.ended() == 0, launch.text()
+    assert "Traceback" not in launch.text() and "[ERROR]" not in launch.text()
 
 
 WRONG = {

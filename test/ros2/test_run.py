@@ -9,6 +9,7 @@ from tools import Tool, Tools
 
 from body_tracking import systems
 from draws import some
+from pose_networks import startable
 
 MARKER_NODES = (
     "marker_cameras",
@@ -17,8 +18,9 @@ MARKER_NODES = (
     "rigid_body_tracker",
     "marker_joint_angles",
 )
-LACKING = ("robot_commands", "bag_player", "kinect_skeleton", "mesh_tracker")
+LACKING = ("robot_commands", "bag_player", "kinect_skeleton", "mesh_tracker", "camera_skeleton")
 """Nodes that do nothing without a parameter."""
+NODES = startable(systems.EXECUTABLES)
 
 
 class AllNodes:
@@ -33,12 +35,13 @@ class AllNodes:
             "robot_commands": {"mapping": mapping},
             "bag_player": {"bag": bag, "topics": "[/kinect2/skeleton]", "start_paused": "true"},
             "mesh_tracker": {"depth": "[kinect1]"},
+            "camera_skeleton": {"cameras": "[camera1]"},
             "bag_recorder": {"folder": "recording", "start_recording": "false"},
             "viewer": {"port": 0},
             **{name: {"setup": tools.share / "config" / "marker_setup"} for name in MARKER_NODES},
         }
         self.tools_of: dict[str, Tool] = {
-            executable: tools.run(executable, **parameters.get(executable, {})) for executable in systems.EXECUTABLES
+            executable: tools.run(executable, **parameters.get(executable, {})) for executable in NODES
         }
 
     def text(self) -> str:
@@ -54,7 +57,7 @@ def all_nodes(workspace: dict[str, str], tmp_path_factory: pytest.TempPathFactor
 
 def test_every_node_publishes_diagnostics(all_nodes: AllNodes) -> None:
     seen = all_nodes.tools.bench.diagnostics
-    wanted = set(systems.EXECUTABLES)
+    wanted = set(NODES)
     assert all_nodes.tools.bench.until(lambda: wanted <= seen.keys(), 60.0), (wanted - seen.keys(), all_nodes.text())
 
 
@@ -69,7 +72,7 @@ def test_every_service_answers(all_nodes: AllNodes) -> None:
 
 
 def test_ctrl_c_ends_every_node_in_order(all_nodes: AllNodes) -> None:
-    assert [tool.process.poll() for tool in all_nodes.tools_of.values()] == [None] * len(systems.EXECUTABLES)
+    assert [tool.process.poll() for tool in all_nodes.tools_of.values()] == [None] * len(NODES)
     for tool in all_nodes.tools_of.values():
         tool.interrupt()
     codes = {name: tool.ended() for name, tool in all_nodes.tools_of.items()}

@@ -116,9 +116,9 @@ class Tools:
         self.started.append(Tool(["ros2", *words], self.folder / f"ros2_{number}.log", environment, self.folder))
         return self.started[-1]
 
-    def launch(self, *arguments: str) -> Tool:
+    def launch(self, *arguments: str, file: str = "two_kinects.launch.py") -> Tool:
         """``ros2 launch`` of the graph."""
-        return self.start("launch", "body_tracking", "two_kinects.launch.py", *arguments)
+        return self.start("launch", "body_tracking", file, *arguments)
 
     def run(self, executable: str, *arguments: str, **parameters: object) -> Tool:
         """``ros2 run`` of a node, or of a command."""

@@ -1,0 +1,209 @@
+"""The stage of ``camera_skeleton`` on the shipped recording: people, and what is said of images that are no use."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from camera_recording import BAG, NAMES, recording
+
+from body_tracking.camera.pose_model import PoseModel, PoseModelError
+from body_tracking.camera.stage import CameraStage
+from body_tracking.camera.topics import COMPRESSED, COMPRESSED_DEPTH
+from body_tracking.core.camera import Camera, CameraError
+from body_tracking.core.parameters import check_all
+from body_tracking.core.skeleton import Joint, Skeleton, TrackingState
+from body_tracking.core.sources import SensorNameError
+from body_tracking.mesh.depth import DepthError
+from body_tracking.pipeline.graph import GraphError
+from body_tracking.pipeline.stage import Now, Output
+from body_tracking.simulation.camera_bags import SECONDS
+from pose_networks import MISSING, REASON
+
+networks = pytest.mark.skipif(bool(MISSING), reason=REASON)
+SEEN = [Joint[f"{name}_{side}"] for side in ("LEFT", "RIGHT") for name in ("SHOULDER", "ELBOW", "WRIST", "KNEE")]
+
+
+def stage(**values: Any) -> CameraStage:
+    return CameraStage(check_all(CameraStage.PARAMETERS, {"cameras": ("camera1",), **values}))
+
+
+def now(stamp_ns: int) -> Now:
+    return Now(stamp_ns, stamp_ns)
+
+
+def calibrated(**values: Any) -> CameraStage:
+    node = stage(**values)
+    node.take(NAMES.colour_info, recording().colour_camera, now(0))
+    node.take(NAMES.depth_info, recording().depth_camera, now(0))
+    return node
+
+
+def show(node: CameraStage, stamp_ns: int, colour: Any, depth: Any, at_ns: int | None = None) -> list[Skeleton]:
+    """The skeletons of one pair of images, whose depth image has another stamp where one is given."""
+    found: list[Output] = list(node.take(NAMES.colour, (stamp_ns, "camera1", colour), now(stamp_ns)))
+    found += node.take(NAMES.depth, (at_ns or stamp_ns, "camera1", depth), now(at_ns or stamp_ns))
+    return [skeleton for output in found for skeleton in output.payload]
+
+
+def test_the_shipped_recording_is_small_and_whole() -> None:
+    recorded = recording()
+    assert sum(path.stat().st_size for path in BAG.iterdir()) < 3e6
+    assert len(recorded.colour) == round(15 * SECONDS)
+    assert recorded.colour.keys() == recorded.depth.keys() == recorded.joints.keys()
+
+
+@networks
+def test_the_joints_of_the_recorded_person_are_found_where_they_are() -> None:
+    node, recorded = calibrated(), recording()
+    errors, inside = [], []
+    for stamp_ns in list(recorded.colour)[::5]:
+        (skeleton,) = show(node, stamp_ns, recorded.colour[stamp_ns], recorded.depth[stamp_ns])
+        assert skeleton.stamp_ns == stamp_ns and skeleton.frame_id == "camera1_optical_frame" and skeleton.body == 0
+        assert skeleton.covariances is not None
+        off = (skeleton.positions - recorded.joints[stamp_ns])[SEEN]
+        errors.append(np.linalg.norm(off, axis=1))
+        inverse = np.linalg.inv(skeleton.covariances[SEEN])
+        inside.append(np.einsum("ji,jik,jk->j", off, inverse, off) < 7.815)
+    assert np.nanmedian(errors) < 0.04 and np.nanmean(errors) < 0.06
+    assert np.mean(inside) > 0.85
+    assert node.counters["camera1 searches for people"] == 1  # then the person is followed
+    assert node.state(0)[:2] == (0, "")
+
+
+@networks
+def test_nobody_is_found_in_an_empty_room_and_a_lost_person_is_searched_for_again() -> None:
+    node, recorded = calibrated(), recording()
+    stamps = list(recorded.colour)
+    first = stamps[0]
+    empty = np.full_like(recorded.colour[first], 170)
+    assert show(node, first - 1_000_000_000, empty, recorded.depth[first]) == []
+    assert len(show(node, first, recorded.colour[first], recorded.depth[first])) == 1
+    assert show(node, stamps[1], empty, recorded.depth[first]) == []
+    assert node.counters["camera1 people lost"] == 1
+    # at the next search, and as somebody else
+    (again,) = show(node, stamps[8], recorded.colour[stamps[8]], recorded.depth[stamps[8]])
+    assert again.body == 1
+
+
+@networks
+def test_images_within_the_tolerance_are_one_pair_and_others_are_counted() -> None:
+    node, recorded = calibrated(), recording()
+    stamps = list(recorded.colour)
+    colour, depth = recorded.colour[stamps[0]], recorded.depth[stamps[0]]
+    (skeleton,) = show(node, stamps[0], colour, depth, stamps[0] + 9_000_000)
+    assert skeleton.stamp_ns == stamps[0]
+    assert show(node, stamps[3], colour, depth, stamps[3] + 30_000_000) == []
+    assert list(node.poll(stamps[3] + 1_000_000_000)) == []
+    assert node.counters["camera1 images without the other one"] == 2
+
+
+@networks
+def test_a_picture_of_a_person_gives_no_skeleton_and_is_named() -> None:
+    node, recorded = calibrated(), recording()
+    stamp_ns = next(iter(recorded.colour))
+    wall = np.full_like(recorded.depth[stamp_ns], 2.2)
+    assert show(node, stamp_ns, recorded.colour[stamp_ns], wall) == []
+    level, text, _ = node.state(0)
+    assert level == 1 and "flat" in text and node.counters["camera1 pictures of people"] == 1
+
+
+@networks
+def test_without_calibration_the_missing_topic_is_named() -> None:
+    node, recorded = stage(), recording()
+    stamp_ns = next(iter(recorded.colour))
+    assert show(node, stamp_ns, recorded.colour[stamp_ns], recorded.depth[stamp_ns]) == []
+    assert NAMES.colour_info in node.state(0)[1] and NAMES.depth_info in node.state(0)[1]
+    node.take(NAMES.colour_info, recorded.colour_camera, now(0))
+    node.take(NAMES.depth_info, recorded.depth_camera, now(0))
+    assert node.state(0)[:2] == (0, "")
+
+
+@networks
+def test_depth_images_that_are_not_registered_are_refused_without_the_pose_of_their_camera() -> None:
+    recorded = recording()
+    one = recorded.depth_camera
+    other = Camera(one.frame_id, one.width, one.height, one.matrix * [[1.2], [1.2], [1.0]], one.distortion)
+    node = stage()
+    node.take(NAMES.colour_info, recorded.colour_camera, now(0))
+    with pytest.raises(CameraError, match="not registered"):
+        node.take(NAMES.depth_info, other, now(0))
+    assert "depth_pose" in node.state(0)[1]
+    posed = stage(depth_pose=("0.02", "0", "0", "0", "0", "0", "1"))
+    posed.take(NAMES.colour_info, recorded.colour_camera, now(0))
+    posed.take(NAMES.depth_info, other, now(0))
+    assert posed.state(0)[:2] == (0, "")
+    for wrong in (("1", "2"), ("0", "0", "0", "0", "0", "0", "0"), ("a",) * 7):
+        with pytest.raises(GraphError, match="depth_pose"):
+            stage(depth_pose=wrong)
+
+
+@networks
+def test_images_of_another_size_are_named_and_a_covered_lens() -> None:
+    node, recorded = calibrated(), recording()
+    stamps = list(recorded.colour)
+    colour, depth = recorded.colour[stamps[0]], recorded.depth[stamps[0]]
+    with pytest.raises(DepthError, match="240 x 180"):
+        show(node, stamps[0], colour[::2, ::2], depth)
+    assert node.counters["camera1 colour images of another size"] == 1
+    assert show(node, stamps[1], colour, np.zeros_like(depth)) == []
+    assert "covered" in node.state(0)[1]
+    assert len(show(node, stamps[9], colour, depth)) == 1
+    assert node.state(0)[:2] == (0, "")
+
+
+@networks
+def test_a_jump_back_forgets_the_people() -> None:
+    node, recorded = calibrated(), recording()
+    stamps = list(recorded.colour)
+    for stamp_ns in stamps[:2]:
+        show(node, stamp_ns, recorded.colour[stamp_ns], recorded.depth[stamp_ns])
+    node.reset(NAMES.colour)
+    assert len(show(node, stamps[0], recorded.colour[stamps[0]], recorded.depth[stamps[0]])) == 1
+    assert node.counters["camera1 searches for people"] == 2
+
+
+@networks
+def test_topics_follow_driver_compression_and_the_lab() -> None:
+    def topics(**values: Any) -> set[str]:
+        return {port.topic for port in stage(**values).inputs}
+
+    assert topics() == {NAMES.colour, NAMES.depth, NAMES.colour_info, NAMES.depth_info}
+    assert "/camera/camera1/aligned_depth_to_color/image_raw" in topics(driver="realsense")
+    assert NAMES.colour + COMPRESSED in topics(compressed="both")
+    assert NAMES.depth + COMPRESSED_DEPTH in topics(compressed="both")
+    own = topics(colour_topic="/lab/{camera}/rgb", driver="oak")
+    assert "/lab/camera1/rgb" in own and "/camera1/stereo/camera_info" in own
+
+
+@networks
+@pytest.mark.parametrize("names", [(), ("camera1", "camera1"), ("1st",)])
+def test_invalid_cameras_are_refused(names: tuple[str, ...]) -> None:
+    with pytest.raises((GraphError, SensorNameError), match=r"camera|name"):
+        stage(cameras=names)
+
+
+def test_missing_and_foreign_networks_are_named(tmp_path: Path) -> None:
+    pytest.importorskip("ai_edge_litert", reason="pip install ai-edge-litert")
+    with pytest.raises(PoseModelError, match=r"no file .*pose_detection.tflite: `body_tracking camera model`"):
+        PoseModel(tmp_path)
+    (tmp_path / "pose_detection.tflite").write_bytes(b"no network")
+    with pytest.raises(PoseModelError, match=r"pose_detection.tflite"):
+        PoseModel(tmp_path)
+
+
+@networks
+def test_states_say_what_is_seen() -> None:
+    node, recorded = calibrated(), recording()
+    stamp_ns = next(iter(recorded.colour))
+    # the lower half of the person is outside of the image
+    colour, depth = recorded.colour[stamp_ns], recorded.depth[stamp_ns]
+    down = np.full_like(colour, 170)
+    down[150:] = colour[:-150]
+    low = np.zeros_like(depth)
+    low[75:] = depth[:-75]
+    (skeleton,) = show(node, stamp_ns, down, low)
+    assert (skeleton.states[SEEN[:2]] == TrackingState.TRACKED).all()
+    assert skeleton.states[Joint.ANKLE_LEFT] == TrackingState.NOT_TRACKED

@@ -1,0 +1,39 @@
+"""``camera_skeleton`` on the shipped images, as ``up`` starts it: skeletons, and angles behind them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS is not installed")
+
+from running import ROOT
+
+from body_tracking.messages.cdr import decode_skeletons
+from body_tracking.pipeline import graph
+from body_tracking.recording.rosbag2 import BagReader
+from excerpts import beginning
+from pose_networks import MISSING, REASON
+from test_up import Up
+
+BAG = ROOT / "bags" / "camera_reaching"
+
+
+@pytest.mark.skipif(bool(MISSING), reason=REASON)
+def test_images_become_skeletons_and_angles_with_deviations(tmp_path: Path) -> None:
+    images, recording = beginning(BAG, tmp_path / "excerpt", 2.0), tmp_path / "recording"
+    given = ("--bag", images, "--camera", "camera1", "--compressed", "colour", "--record", recording, "--reliable")
+    live = Up(tmp_path, *given)
+    try:
+        assert live.until(lambda: live.process.poll() is not None, timeout=120.0), live.text()
+        assert live.process.returncode == 0, live.text()
+    finally:
+        live.close()
+    of_body = graph.joint_states_topic("body1"), graph.joint_states_stddev_topic("body1")
+    topics = [graph.skeleton_topic("camera1"), *of_body]
+    with BagReader(recording) as reader:
+        counts = {topic: reader.topics[topic].count for topic in topics}
+        skeletons = [decode_skeletons(raw.cdr) or () for raw in reader.messages(topics[:1])]
+    assert counts[topics[0]] >= 29 and all(len(each) == 1 for each in skeletons)
+    assert counts[topics[1]] == counts[topics[2]] >= 25
