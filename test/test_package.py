@@ -127,7 +127,8 @@ def test_every_import_is_a_declared_dependency(manifest: ElementTree.Element, wh
             continue
         if module in EXTRAS:
             extra = EXTRAS[module]
-            assert re.search(rf"^Requires-Dist: {module}\b.*; extra == .{extra}.$", text, re.MULTILINE), "setup.py"
+            name = module.replace("_", "-")
+            assert re.search(rf"^Requires-Dist: {name}\b.*; extra == .{extra}.$", text, re.MULTILINE), "setup.py"
             assert f"[{extra}]" in readme, f"{extra}: no pip line in README.md"
             continue
         if module not in LIBRARIES:

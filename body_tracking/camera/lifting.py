@@ -21,16 +21,19 @@ from body_tracking.mesh.depth import axial_noise
 
 _BODY_SIDE: Final = 2.2
 """Metres: side of the region around an upright person, which the landmarks' errors are proportional to."""
-_ACROSS: Final = 0.022
+_ACROSS: Final = 0.016
 """Metres: standard deviation of a landmark across the line of sight, per axis, in a region of :data:`_BODY_SIDE`: 95 %
 of the landmarks are within a fifth of the trunk's length, as published for this network (Grishchenko et al. 2022,
 arXiv:2206.11678, table 2), most of them much nearer."""
-_HIDDEN: Final = 3.0
+_HIDDEN: Final = 7.0
 """Factor on it for a landmark that the network guesses."""
-_ALONG: Final = 0.025
+_ALONG: Final = 0.02
 """Metres: standard deviation of the depth of a joint's centre behind the surface: people and clothes differ."""
-_GUESSED_ALONG: Final = 0.12
+_GUESSED_ALONG: Final = 0.25
 """The same where the depth is only expected."""
+_DISAGREED: Final = 0.5
+"""Share of the difference between the depths measured and expected that is added to it: where the limb is behind the
+trunk, as of somebody seen from the side, the two differ."""
 _WINDOW: Final = 0.03
 """Metres to each side of a landmark in which its surface is looked for."""
 _EXPECTED: Final = 0.25
@@ -43,37 +46,39 @@ _FLAT: Final = 0.005
 """Metres: a body whose surface is off a plane by less than this and the camera's noise, RMS, is a picture of one; the
 flattest of simulated people, who stand straight before the camera, are off by 10 mm."""
 
-# The landmarks whose mean each joint is, and how far its centre is behind the surface in metres: half of the segment's
-# depth there, of adults in clothes.
-_MADE_OF: Final[dict[Joint, tuple[tuple[Landmark, ...], float]]] = {
-    Joint.HEAD: ((Landmark.EAR_LEFT, Landmark.EAR_RIGHT), 0.08),
+# The landmarks whose mean each joint is; how far its centre is behind the surface in metres: half of the
+# segment's depth there, of adults in clothes; and by how many metres per axis what the landmark marks is displaced from the joint.
+_MADE_OF: Final[dict[Joint, tuple[tuple[Landmark, ...], float, float]]] = {
+    Joint.HEAD: ((Landmark.EAR_LEFT, Landmark.EAR_RIGHT), 0.09, 0.035),
     **{
-        Joint[f"{joint}_{side}"]: (tuple(Landmark[f"{each}_{side}"] for each in names), behind)
+        Joint[f"{joint}_{side}"]: (tuple(Landmark[f"{each}_{side}"] for each in names), behind, displaced)
         for side in ("LEFT", "RIGHT")
-        for joint, names, behind in (
-            ("SHOULDER", ("SHOULDER",), 0.06),
-            ("ELBOW", ("ELBOW",), 0.04),
-            ("WRIST", ("WRIST",), 0.03),
-            ("HAND", ("WRIST", "INDEX_FINGER", "LITTLE_FINGER"), 0.02),
-            ("HIP", ("HIP",), 0.10),
-            ("KNEE", ("KNEE",), 0.06),
-            ("ANKLE", ("ANKLE",), 0.04),
-            ("FOOT", ("TOES",), 0.02),
+        for joint, names, behind, displaced in (
+            ("SHOULDER", ("SHOULDER",), 0.065, 0.02),
+            ("ELBOW", ("ELBOW",), 0.05, 0.01),
+            ("WRIST", ("WRIST",), 0.035, 0.01),
+            ("HAND", ("WRIST", "INDEX_FINGER", "LITTLE_FINGER"), 0.02, 0.025),
+            ("HIP", ("HIP",), 0.12, 0.025),
+            ("KNEE", ("KNEE",), 0.07, 0.01),
+            ("ANKLE", ("ANKLE",), 0.05, 0.02),
+            ("FOOT", ("TOES",), 0.045, 0.025),
         )
     },
 }
 _JOINTS: IntArray = np.array(list(_MADE_OF), dtype=np.intp)
 _WEIGHTS: FloatArray = np.zeros((len(_MADE_OF), len(Landmark)))
-for _row, (_names, _) in enumerate(_MADE_OF.values()):
+for _row, (_names, _, _) in enumerate(_MADE_OF.values()):
     _WEIGHTS[_row, list(_names)] = 1.0 / len(_names)
-_BEHIND: FloatArray = np.array([behind for _, behind in _MADE_OF.values()])
+_BEHIND: FloatArray = np.array([behind for _, behind, _ in _MADE_OF.values()])
+_DISPLACED: FloatArray = np.array([displaced for _, _, displaced in _MADE_OF.values()])
 
-# Joints of the trunk that no landmark is at, as weights of the middles of the shoulders and of the hips.
-_TRUNK: Final[dict[Joint, tuple[float, float]]] = {
-    Joint.SPINE_BASE: (0.0, 1.0),
-    Joint.SPINE_MID: (0.578, 0.422),
-    Joint.SPINE_SHOULDER: (1.0, 0.0),
-    Joint.NECK: (1.12, -0.12),
+# Joints of the trunk that no landmark is at, as weights of the middles of the shoulders and of the hips, and by how
+# many metres per axis they are displaced from there. A Kinect's SpineMid divides the line between them so, in real people.
+_TRUNK: Final[dict[Joint, tuple[float, float, float]]] = {
+    Joint.SPINE_BASE: (0.0, 1.0, 0.02),
+    Joint.SPINE_MID: (0.578, 0.422, 0.05),
+    Joint.SPINE_SHOULDER: (1.0, 0.0, 0.01),
+    Joint.NECK: (1.12, -0.12, 0.02),
 }
 _SHOULDERS = (Joint.SHOULDER_LEFT, Joint.SHOULDER_RIGHT)
 _HIPS = (Joint.HIP_LEFT, Joint.HIP_RIGHT)
@@ -132,10 +137,12 @@ def lift(found: Landmarks, depth: SingleArray, camera: Camera) -> Lifted | None:
     positions = rays * (np.where(seen, surface, expected) + _BEHIND)[:, None]
     scale = found.region.side * trunk / focal / _BODY_SIDE
     across = _ACROSS * scale * np.where(seen, 1.0, _HIDDEN)
-    along = np.where(seen, np.hypot(_ALONG, spread), _GUESSED_ALONG)
+    doubt = np.where(seen, _DISAGREED * np.abs(surface - expected), 0.0)
+    along = np.where(seen, np.sqrt(_ALONG**2 + spread**2 + doubt**2), _GUESSED_ALONG)
     unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     outer = unit[:, :, None] * unit[:, None, :]
     covariances = (across**2)[:, None, None] * (np.eye(3) - outer) + (along**2)[:, None, None] * outer
+    covariances += (_DISPLACED**2)[:, None, None] * np.eye(3)
     return _whole(positions, covariances, seen, present & np.isfinite(positions).all(axis=1))
 
 
@@ -195,13 +202,13 @@ def _whole(positions: FloatArray, covariances: FloatArray, seen: BoolArray, know
     made = _JOINTS[known]
     points[made], spread[made] = positions[known], covariances[known]
     states[made] = np.where(seen[known], TrackingState.TRACKED, TrackingState.INFERRED)
-    for joint, (of_shoulders, of_hips) in _TRUNK.items():
+    for joint, (of_shoulders, of_hips, displaced) in _TRUNK.items():
         parts = [(of_shoulders / 2.0, each) for each in _SHOULDERS] + [(of_hips / 2.0, each) for each in _HIPS]
         used = [(weight, each) for weight, each in parts if weight]
         if any(states[each] == TrackingState.NOT_TRACKED for _, each in used):
             continue
         points[joint] = sum(weight * points[each] for weight, each in used)
         # the errors of the trunk's landmarks are alike
-        spread[joint] = np.mean([spread[each] for _, each in used], axis=0)
+        spread[joint] = np.mean([spread[each] for _, each in used], axis=0) + displaced**2 * np.eye(3)
         states[joint] = min(states[each] for _, each in used)
     return Lifted(points, states, spread)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from body_tracking.core.camera import Camera
-from body_tracking.core.skeleton import FloatArray, SingleArray
+from body_tracking.core.skeleton import FloatArray, IntArray, SingleArray
 from body_tracking.core.sources import optical_frame
 from body_tracking.mesh.raster import render
 from body_tracking.simulation.depth_scene import DepthFrame, DepthScene
@@ -46,13 +46,15 @@ class Painter:
     Attributes:
         scene: of a person in a room.
         camera: at the place of the scene's depth camera.
-        colours: (F, 3) red, green, blue of each face of the body.
+        faces: (F, 3) of the body without the strands of hair, which would hide the face of the person.
+        colours: (F, 3) red, green, blue of each of them.
         background: (height, width, 3) the room.
         distance: (height, width) metres to it; 0 where there is nothing.
     """
 
     scene: DepthScene
     camera: Camera
+    faces: IntArray
     colours: FloatArray
     background: FloatArray
     distance: SingleArray
@@ -70,15 +72,16 @@ class Painter:
         background[(room.faces >= 0) & (heights[room.faces] < _ON_FLOOR)] = floor
         rng = np.random.default_rng([scene.seed, 20250101])
         background += rng.normal(scale=_NOISE, size=background.shape)
-        return cls(scene, camera, _colours(scene.who.body, rng), background, room.depth)
+        body = scene.who.body
+        shown = body.materials != HAIR
+        return cls(scene, camera, body.faces[shown], _colours(body, rng)[shown], background, room.depth)
 
     def image(self, frame: DepthFrame) -> NDArray[np.uint8]:
         """(height, width, 3) red, green, blue of a frame of the scene."""
-        body = self.scene.who.body
-        own = render(frame.vertices, body.faces, self.camera)
+        own = render(frame.vertices, self.faces, self.camera)
         seen = (own.depth > 0.0) & ((self.distance == 0.0) | (own.depth < self.distance))
         face = own.faces[seen]
-        direction = normals(frame.vertices, body.faces)[body.faces[face]].mean(axis=1)
+        direction = normals(frame.vertices, self.faces)[self.faces[face]].mean(axis=1)
         light = _AMBIENT + (1.0 - _AMBIENT) * np.clip(direction @ (_LAMP / np.linalg.norm(_LAMP)), 0.0, 1.0)
         picture = self.background.copy()
         picture[seen] = self.colours[face] * light[:, None]
@@ -94,10 +97,7 @@ def _colours(body: Body, rng: np.random.Generator) -> FloatArray:
     shirt, trousers = rng.uniform(40.0, 220.0, 3), rng.uniform(25.0, 110.0, 3)
     centres = body.vertices[body.faces].mean(axis=1)
     colours = np.tile(skin, (len(body.faces), 1))
-    strands = body.materials == HAIR
-    colours[strands] = hair
-    # strands that hang down before the chest are drawn as the shirt
-    cloth = (body.materials == CLOTH) | (strands & (centres[:, 2] < body.head_of("neck01")[2] + 0.03))
+    cloth = body.materials == CLOTH
     hips = body.head_of("upperleg01.L")[2] + 0.08
     colours[cloth] = np.where(centres[cloth, 2:] > hips, shirt, trousers)
     face = body.materials == SKIN

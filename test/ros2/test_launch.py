@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from sensor_msgs.msg import JointState
 from tools import NO_DAEMON, Tools
 
