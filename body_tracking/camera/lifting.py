@@ -46,8 +46,8 @@ _FLAT: Final = 0.005
 """Metres: a body whose surface is off a plane by less than this and the camera's noise, RMS, is a picture of one; the
 flattest of simulated people, who stand straight before the camera, are off by 10 mm."""
 
-# The landmarks whose mean each joint is; how far its centre is behind the surface in metres: half of the
-# segment's depth there, of adults in clothes; and by how many metres per axis what the landmark marks is displaced from the joint.
+# The landmarks whose mean each joint is; how far its centre is behind the surface, metres: half of the segment's depth
+# there, of adults in clothes; and by how many metres per axis what the landmark marks is displaced from the joint.
 _MADE_OF: Final[dict[Joint, tuple[tuple[Landmark, ...], float, float]]] = {
     Joint.HEAD: ((Landmark.EAR_LEFT, Landmark.EAR_RIGHT), 0.09, 0.035),
     **{
@@ -72,8 +72,8 @@ for _row, (_names, _, _) in enumerate(_MADE_OF.values()):
 _BEHIND: FloatArray = np.array([behind for _, behind, _ in _MADE_OF.values()])
 _DISPLACED: FloatArray = np.array([displaced for _, _, displaced in _MADE_OF.values()])
 
-# Joints of the trunk that no landmark is at, as weights of the middles of the shoulders and of the hips, and by how
-# many metres per axis they are displaced from there. A Kinect's SpineMid divides the line between them so, in real people.
+# Joints of the trunk that no landmark is at, as weights of the middles of the shoulders and of the hips, and by how many
+# metres per axis they are displaced. A Kinect's SpineMid divides the line between them so, in real people.
 _TRUNK: Final[dict[Joint, tuple[float, float, float]]] = {
     Joint.SPINE_BASE: (0.0, 1.0, 0.02),
     Joint.SPINE_MID: (0.578, 0.422, 0.05),
