@@ -18,7 +18,7 @@ from body_tracking.core import so3
 from body_tracking.core.compiled import compiled
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import FloatArray, IntArray
-from body_tracking.markers import projection
+from body_tracking.markers import hartley_sturm, projection
 from body_tracking.markers.observations import ImageBalls
 from body_tracking.markers.rig import POSE, Rig
 
@@ -50,6 +50,7 @@ class RigRays:
         flat_factor: (c, cells, cells, 2, r) what they add to the image coordinates x/z, y/z of a far point, against
             those of its pixel, by cells of the image.
         cell: (c, 2) pixels.
+        epipolar: fundamental matrix and epipoles of the first two cameras (:func:`hartley_sturm.fundamental`).
     """
 
     index: dict[str, int]
@@ -62,6 +63,7 @@ class RigRays:
     translation_factor: FloatArray
     flat_factor: FloatArray
     cell: FloatArray
+    epipolar: tuple[FloatArray, FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,10 +114,12 @@ def rig_rays(rig: Rig) -> RigRays:
         by_turn = np.stack([-x * y, 1.0 + x * x, -y, -1.0 - y * y, x * y, x], axis=-1).reshape(-1, 2, 3)
         added = np.linalg.solve(by_flat, by_lens @ lens) + by_turn @ turn
         flat_factor[index] = np.nan_to_num(added).reshape(_CELLS, _CELLS, 2, count)
+    focal = np.array([camera.matrix[[0, 1], [0, 1]] for camera in cameras])
+    centre = np.array([camera.matrix[:2, 2] for camera in cameras])
     return RigRays(
         {camera.frame_id: index for index, camera in enumerate(cameras)},
-        np.array([camera.matrix[[0, 1], [0, 1]] for camera in cameras]),
-        np.array([camera.matrix[:2, 2] for camera in cameras]),
+        focal,
+        centre,
         coefficients,
         rig.rotations,
         rig.translations,
@@ -123,6 +127,7 @@ def rig_rays(rig: Rig) -> RigRays:
         translation_factor,
         flat_factor,
         cell,
+        hartley_sturm.fundamental(rig.rotations[:2], rig.translations[:2], focal[:2], centre[:2]),
     )
 
 
@@ -161,79 +166,100 @@ def make_rays(geometry: RigRays, images: Sequence[ImageBalls]) -> Rays:
     first = [0, *np.cumsum(counts).tolist()]
     pixels = np.concatenate([image.pixels for image in present]) if present else np.zeros((0, 2))
     covariance = np.concatenate([image.covariance for image in present]) if present else np.zeros((0, 2, 2))
-    xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-    if not (np.isfinite(pixels).all() and np.isfinite(covariance).all() and ((xx > 0.0) & (xx * yy > xy * xy)).all()):
-        bad = np.flatnonzero(
-            ~(np.isfinite(pixels).all(axis=-1) & np.isfinite(covariance).all(axis=(1, 2)) & (xx > 0.0))
-            | ~(xx * yy > xy * xy)
-        )[0]
-        camera = int(np.searchsorted(first, bad, side="right")) - 1
+    cameras = np.repeat(np.arange(len(counts)), counts)
+    size, unknowns = len(pixels), geometry.flat_factor.shape[-1]
+    flat, directions, flat_factor = np.empty((size, 2)), np.empty((size, 3)), np.empty((size, 2, unknowns))
+    spread, weight = np.empty((size, 2, 2)), np.empty((size, 2, 2))
+    optics = geometry.focal, geometry.centre, geometry.distortion, geometry.rotations
+    cells = geometry.cell, geometry.flat_factor
+    bad = _rays(pixels, covariance, cameras, optics, cells, flat, spread, weight, directions, flat_factor)
+    if bad >= 0:
+        camera = int(cameras[bad])
         raise TriangulationError(
             f"ball {bad - first[camera]} of camera {list(geometry.index)[camera]}: pixels {pixels[bad].tolist()}, "
             f"covariance {covariance[bad].tolist()}; expected finite numbers and a positive definite covariance"
         )
-    cameras = np.repeat(np.arange(len(counts)), counts)
-    balls = np.arange(len(pixels)) - np.asarray(first)[cameras]
-    focal = geometry.focal[cameras]
-    flat, jacobian = _undistort((pixels - geometry.centre[cameras]) / focal, geometry.distortion, cameras)
-    jxx, jxy, jyy = jacobian.T
-    # Cholesky's root of the centroid's covariance, brought into image coordinates
-    root = np.zeros((len(pixels), 2, 2))
-    root[:, 0, 0] = np.sqrt(xx)
-    root[:, 1, 0] = xy / root[:, 0, 0]
-    root[:, 1, 1] = np.sqrt(yy - root[:, 1, 0] ** 2)
-    root /= focal[:, :, None]
-    inverse = np.stack([jyy, -jxy, -jxy, jxx], axis=-1).reshape(-1, 2, 2) / (jxx * jyy - jxy * jxy)[:, None, None]
-    spread = inverse @ root
-    a, b, c, d = spread[:, 0, 0], spread[:, 0, 1], spread[:, 1, 0], spread[:, 1, 1]
-    unspread = np.stack([d, -b, -c, a], axis=-1).reshape(-1, 2, 2) / (a * d - b * c)[:, None, None]
-    directions = flat[:, None, :] @ geometry.rotations[cameras, :2]
-    directions = directions[:, 0] + geometry.rotations[cameras, 2]
-    column = np.clip(((pixels + 0.5) / geometry.cell[cameras]).astype(np.intp), 0, _CELLS - 1)
-    return Rays(
-        cameras,
-        balls,
-        flat,
-        spread,
-        unspread.transpose(0, 2, 1) @ unspread,
-        directions,
-        geometry.flat_factor[cameras, column[:, 1], column[:, 0]],
-        first,
-    )
+    balls = np.arange(size) - np.asarray(first)[cameras]
+    return Rays(cameras, balls, flat, spread, weight, directions, flat_factor, first)
 
 
 @compiled
-def _undistort(seen: FloatArray, distortion: FloatArray, cameras: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Ideal image coordinates (m, 2) of distorted ones, and the derivative of distortion there: (m, 3) xx, xy, yy.
+def _rays(
+    pixels: FloatArray,
+    covariance: FloatArray,
+    cameras: IntArray,
+    optics: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+    cells: tuple[FloatArray, FloatArray],
+    flat: FloatArray,
+    spread: FloatArray,
+    weight: FloatArray,
+    directions: FloatArray,
+    flat_factor: FloatArray,
+) -> int:
+    """Write the fields of :class:`Rays`; the index of the first ball whose numbers are invalid, or -1."""
+    focal, centre, distortion, rotations = optics
+    cell, table = cells
+    for n in range(len(pixels)):
+        u, v = pixels[n]
+        xx, xy, yy = covariance[n, 0, 0], covariance[n, 0, 1], covariance[n, 1, 1]
+        finite = math.isfinite(u + v) and math.isfinite(xx + xy + yy + covariance[n, 1, 0])
+        if not (finite and xx > 0.0 and xx * yy > xy * xy):
+            return n
+        camera = cameras[n]
+        fx, fy = focal[camera]
+        x, y, jxx, jxy, jyy = _undistorted(
+            (u - centre[camera, 0]) / fx, (v - centre[camera, 1]) / fy, distortion[:, camera]
+        )
+        flat[n, 0], flat[n, 1] = x, y
+        # Cholesky's root of the centroid's covariance, brought into image coordinates
+        root = math.sqrt(xx)
+        a, c = root / fx, xy / root / fy
+        d = math.sqrt(yy - (xy / root) ** 2) / fy
+        determinant = jxx * jyy - jxy * jxy
+        s00, s01 = (jyy * a - jxy * c) / determinant, -jxy * d / determinant
+        s10, s11 = (jxx * c - jxy * a) / determinant, jxx * d / determinant
+        spread[n, 0, 0], spread[n, 0, 1], spread[n, 1, 0], spread[n, 1, 1] = s00, s01, s10, s11
+        square = (s00 * s11 - s01 * s10) ** 2
+        weight[n, 0, 0], weight[n, 1, 1] = (s10 * s10 + s11 * s11) / square, (s00 * s00 + s01 * s01) / square
+        weight[n, 0, 1] = weight[n, 1, 0] = -(s00 * s10 + s01 * s11) / square
+        for k in range(3):
+            directions[n, k] = x * rotations[camera, 0, k] + y * rotations[camera, 1, k] + rotations[camera, 2, k]
+        column = min(max(int((u + 0.5) / cell[camera, 0]), 0), _CELLS - 1)
+        row = min(max(int((v + 0.5) / cell[camera, 1]), 0), _CELLS - 1)
+        for axis in range(2):
+            for k in range(table.shape[4]):
+                flat_factor[n, axis, k] = table[camera, row, column, axis, k]
+    return -1
 
-    As :meth:`Camera.undistort`, whose conventions it follows, for points of several cameras at once.
+
+@compiled
+def _undistorted(u: float, v: float, distortion: FloatArray) -> tuple[float, float, float, float, float]:
+    """Ideal image coordinates of distorted ones, NaN where there are none; the derivative of distortion: xx, xy, yy.
+
+    As :meth:`Camera.undistort`, whose conventions it follows.
     """
-    flat, jacobian = np.empty_like(seen), np.empty((len(seen), 3))
-    for n in range(len(seen)):
-        k1, k2, p1, p2, k3, k4, k5, k6 = distortion[:, cameras[n]]
-        u, v = seen[n]
-        x, y = u, v
-        moved, jxx, jxy, jyy, determinant = math.inf, 1.0, 0.0, 1.0, 1.0
-        for _ in range(_NEWTON):
-            r2 = x * x + y * y
-            below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
-            radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / below
-            # twice the derivative by r2
-            slope = 2.0 * k1 + r2 * (4.0 * k2 + 6.0 * r2 * k3)
-            slope = (slope - radial * (2.0 * k4 + r2 * (4.0 * k5 + 6.0 * r2 * k6))) / below
-            du = u - x * radial - 2.0 * p1 * x * y - p2 * (r2 + 2.0 * x * x)
-            dv = v - y * radial - p1 * (r2 + 2.0 * y * y) - 2.0 * p2 * x * y
-            jxx = radial + x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
-            jyy = radial + y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
-            jxy = x * y * slope + 2.0 * (p1 * x + p2 * y)
-            determinant = jxx * jyy - jxy * jxy
-            dx, dy = (jyy * du - jxy * dv) / determinant, (jxx * dv - jxy * du) / determinant
-            x, y = x + dx, y + dy
-            moved = abs(dx) + abs(dy)
-            if not moved > 1e3 * _CONVERGED:  # the next step would be the square of this one
-                break
-        # determinant and sign: within the range where the polynomials are monotonic
-        known = moved < 1e4 * _CONVERGED and determinant > 0.0 and x * u + y * v >= 0.0
-        flat[n, 0], flat[n, 1] = (x, y) if known else (math.nan, math.nan)
-        jacobian[n, 0], jacobian[n, 1], jacobian[n, 2] = jxx, jxy, jyy
-    return flat, jacobian
+    k1, k2, p1, p2, k3, k4, k5, k6 = distortion
+    x, y = u, v
+    moved, jxx, jxy, jyy, determinant = math.inf, 1.0, 0.0, 1.0, 1.0
+    for _ in range(_NEWTON):
+        r2 = x * x + y * y
+        below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / below
+        # twice the derivative by r2
+        slope = 2.0 * k1 + r2 * (4.0 * k2 + 6.0 * r2 * k3)
+        slope = (slope - radial * (2.0 * k4 + r2 * (4.0 * k5 + 6.0 * r2 * k6))) / below
+        du = u - x * radial - 2.0 * p1 * x * y - p2 * (r2 + 2.0 * x * x)
+        dv = v - y * radial - p1 * (r2 + 2.0 * y * y) - 2.0 * p2 * x * y
+        jxx = radial + x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
+        jyy = radial + y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
+        jxy = x * y * slope + 2.0 * (p1 * x + p2 * y)
+        determinant = jxx * jyy - jxy * jxy
+        dx, dy = (jyy * du - jxy * dv) / determinant, (jxx * dv - jxy * du) / determinant
+        x, y = x + dx, y + dy
+        moved = abs(dx) + abs(dy)
+        if not moved > 1e3 * _CONVERGED:  # the next step would be the square of this one
+            break
+    # determinant and sign: within the range where the polynomials are monotonic
+    if not (moved < 1e4 * _CONVERGED and determinant > 0.0 and x * u + y * v >= 0.0):
+        x = y = math.nan
+    return x, y, jxx, jxy, jyy

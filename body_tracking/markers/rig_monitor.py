@@ -11,7 +11,7 @@ Two cameras cannot tell which of them turned about the line that joins them: the
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Final
@@ -30,6 +30,8 @@ _PLACE: Final = 5.0
 """Pixels after which a ball's distance is another, independent one."""
 _RATE: Final = 60.0
 """Images per second, about."""
+_FELT: Final = 1e-2
+"""Information of the distances about an unknown of the calibration, in units of its prior, below which it stays."""
 _CUT: Final = 9.0
 """Squared standard deviations at which the cost of an outlier ends."""
 
@@ -219,6 +221,16 @@ class RigMonitor:
 
     def finding(self) -> Finding | None:
         """What is wrong, or None: nothing, or nothing that is sure yet."""
+        search = self.search()
+        while True:
+            try:
+                next(search)
+            except StopIteration as end:
+                found: Finding | None = end.value
+                return found
+
+    def search(self) -> Generator[None, None, Finding | None]:
+        """:meth:`finding` of the images until now, in steps of some 2 ms that leave time for images between them."""
         settings, count = self._settings, len(self._rig.cameras)
         distance = np.concatenate([np.zeros(0), *(each.distance for each in self._window)])
         if len(distance) < settings.min_distances:
@@ -231,18 +243,21 @@ class RigMonitor:
         share = np.concatenate([each.share for each in self._window])
         by_turn = np.concatenate([each.by_turn for each in self._window])
         by_delay = np.concatenate([each.by_delay for each in self._window])
-        by_calibration = np.concatenate([each.by_calibration for each in self._window])
+        by_calibration = _felt(np.concatenate([each.by_calibration for each in self._window]), variance)
         limits = settings.reach / float(self._geometry.focal.mean()), settings.max_delay
         nothing = _explain(distance, variance, share, by_calibration, np.zeros((len(distance), 0)), 1.0)
+        yield
         fits: list[tuple[float, Fault, str, _Explanation]] = []
         for camera in range(count):
             frame = self._rig.cameras[camera].frame_id
             turn = by_turn[:, 3 * camera : 3 * camera + 3]
             turn_fit = _explain(distance, variance, share, by_calibration, turn, limits[0])
             fits.append((turn_fit.cost, Fault.MOVED_CAMERA, frame, turn_fit))
+            yield
             delay_fit = _explain(distance, variance, share, by_calibration, by_delay[:, camera : camera + 1], limits[1])
             if delay_fit.cause[0] > 0.0 or count > 2:  # of two cameras, that one is late is that the other is early
                 fits.append((delay_fit.cost, Fault.OUT_OF_STEP, frame, delay_fit))
+            yield
         fits.sort(key=lambda fit: fit[0])
         cost, fault, frame, best = fits[0]
         least = settings.min_turn if fault is Fault.MOVED_CAMERA else settings.min_delay
@@ -348,6 +363,12 @@ def _velocities(last: ImageBalls, image: ImageBalls) -> FloatArray:
     mutual = back[nearest] == rows
     velocities[mutual] = (image.pixels[mutual] - last.pixels[nearest[mutual]]) / passed
     return velocities
+
+
+def _felt(by_calibration: FloatArray, variance: FloatArray) -> FloatArray:
+    """(n, s) the derivative by those few combinations of the calibration's unknowns (n, r) that distances show."""
+    values, vectors = np.linalg.eigh(by_calibration.T @ (by_calibration / variance[:, None]))
+    return np.asarray(by_calibration @ vectors[:, values > _FELT])
 
 
 def _explain(

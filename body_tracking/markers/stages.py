@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
@@ -37,7 +37,9 @@ from body_tracking.pipeline.stage import Now, Output, Port, Stage
 _SATURATED: Final = 0.05
 """Share of an image's pixels beyond which it is called saturated: 15 balls, 1 m away, fill less than 1 % of 640x480."""
 _WATCH_NS: Final = NANOSECONDS // 4
-"""Between two looks for a moved camera: each takes some 15 ms, and a fault is to be named within a second."""
+"""Between two searches for a moved camera, of some frames each; a fault is to be named within a second."""
+_SEARCH_NS: Final = NANOSECONDS // 10
+"""After which a search is brought to its end at the next images, few as they come."""
 _LONGEST_NS: Final = NANOSECONDS // 5
 """Between two frames whose difference is a rate."""
 CONVENTION: Final = "markers"
@@ -161,6 +163,7 @@ class TriangulationStage(Stage):
         self._monitor = RigMonitor(self.rig)
         self._watched_ns: int | None = None
         self._finding: Finding | None = None
+        self._search: Generator[None, None, Finding | None] | None = None
         self._counters: Counter[str] = Counter()
         self._diameter = float(str(values["diameter"]))
         frames = [camera.frame_id for camera in self.rig.cameras]
@@ -204,7 +207,7 @@ class TriangulationStage(Stage):
     def reset(self, topic: str) -> None:
         self._sets.reset()
         self._monitor.reset()
-        self._watched_ns = self._finding = None
+        self._watched_ns = self._finding = self._search = None
 
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
         """A camera that was moved, or one out of step with the others, by its images or by its stamps, is named."""
@@ -227,13 +230,20 @@ class TriangulationStage(Stage):
         stamp_ns = balls[0].stamp_ns
         if self._watched_ns is None or stamp_ns < self._watched_ns:
             self._watched_ns = stamp_ns
-        if stamp_ns - self._watched_ns < _WATCH_NS:
-            return
-        self._watched_ns, before, self._finding = stamp_ns, self._finding, self._monitor.finding()
-        if self._finding is not None:
-            self._counters[f"{self._finding.fault.value} found"] += 1
-            if before is None or before.fault is not self._finding.fault:
-                self.events.append(str(self._finding))
+        if self._search is None:
+            if stamp_ns - self._watched_ns < _WATCH_NS:
+                return
+            self._watched_ns, self._search = stamp_ns, self._monitor.search()
+        try:
+            next(self._search)
+            while stamp_ns - self._watched_ns > _SEARCH_NS:
+                next(self._search)
+        except StopIteration as end:
+            self._search, before, self._finding = None, self._finding, end.value
+            if self._finding is not None:
+                self._counters[f"{self._finding.fault.value} found"] += 1
+                if before is None or before.fault is not self._finding.fault:
+                    self.events.append(str(self._finding))
 
     @property
     def counters(self) -> Mapping[str, int]:

@@ -7,14 +7,15 @@ point is that of the centroids' noise; what the calibration is wrong by is :func
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 
-from body_tracking.core import so3
 from body_tracking.core.camera import Camera
+from body_tracking.core.compiled import compiled
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
 from body_tracking.markers import hartley_sturm, projection
 from body_tracking.markers.observations import ImageBalls, Points
@@ -132,28 +133,16 @@ def epipolar_pairs(geometry: RigRays, rays: Rays, a: int, b: int, settings: Tria
     Gaschler (2011): figure 3.2.
     """
     of_a, of_b = slice(rays.first[a], rays.first[a + 1]), slice(rays.first[b], rays.first[b + 1])
-    baseline = geometry.positions[b] - geometry.positions[a]
-    # the volume that two rays span with the baseline b, d_b . (b x d_a), and its derivative by either direction
-    cross = so3.skew(baseline)
-    by_b = -rays.directions[of_a] @ cross
-    by_a = rays.directions[of_b] @ cross
-    volume = by_b @ rays.directions[of_b].T
-    a_plane, b_plane = geometry.rotations[a, :2].T, geometry.rotations[b, :2].T  # (3, 2) of image coordinates
-    by_a_flat, by_b_flat = by_a @ a_plane, by_b @ b_plane  # (width, 2), (height, 2)
-    a_noise = (by_a_flat @ rays.spread[of_a]).transpose(1, 0, 2)  # (n_b, 2) x (n_a, 2, 2)
-    b_noise = by_b_flat @ rays.spread[of_b]  # (n_b, n_a, 2)
-    variance = (a_noise**2).sum(axis=-1).T + (b_noise**2).sum(axis=-1).T
-    if geometry.translation_factor.shape[2]:
-        # a pixel that stays moves its ray against what moves a point's image
-        a_moves = by_a_flat @ rays.flat_factor[of_a]  # (n_a, n_b, r)
-        b_moves = (by_b_flat @ rays.flat_factor[of_b]).transpose(1, 0, 2)
-        shift = geometry.rotations[a].T @ geometry.translation_factor[a]
-        shift = shift - geometry.rotations[b].T @ geometry.translation_factor[b]  # (3, r) of the baseline
-        across = (rays.directions[of_a] @ (so3.skew(rays.directions[of_b]) @ shift)).transpose(1, 0, 2)
-        moves = across - a_moves - b_moves
-        variance += (moves**2).sum(axis=-1)
-    with np.errstate(invalid="ignore"):
-        distance = volume / np.sqrt(variance)
+    shift = geometry.rotations[a].T @ geometry.translation_factor[a]
+    shift -= geometry.rotations[b].T @ geometry.translation_factor[b]  # (3, r) of the baseline
+    distance = np.empty((of_a.stop - of_a.start, of_b.stop - of_b.start))
+    _epipolar_distances(
+        geometry.positions[b] - geometry.positions[a],
+        shift,
+        (geometry.rotations[a], rays.directions[of_a], rays.spread[of_a], rays.flat_factor[of_a]),
+        (geometry.rotations[b], rays.directions[of_b], rays.spread[of_b], rays.flat_factor[of_b]),
+        distance,
+    )
     size = np.where(np.isfinite(distance), np.abs(distance), np.inf)
     good = size < settings.gate
     if max(good.sum(axis=0).max(initial=0), good.sum(axis=1).max(initial=0)) > settings.alternatives:
@@ -165,35 +154,100 @@ def epipolar_pairs(geometry: RigRays, rays: Rays, a: int, b: int, settings: Tria
     return Pairs(first + of_a.start, second + of_b.start, distance[first, second])
 
 
+@compiled
+def _epipolar_distances(
+    baseline: FloatArray,
+    shift: FloatArray,
+    a: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+    b: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+    distance: FloatArray,
+) -> None:
+    """Write the distances (n_a, n_b) of two cameras' balls from each other's epipolar lines, standard deviations.
+
+    Args:
+        baseline: (3,) from the first camera to the second.
+        shift: (3, r) what the calibration's unknowns add to it.
+        a: rotation (3, 3) of the first camera; directions, spread and flat_factor of its balls.
+        b: of the second.
+        distance: is written.
+    """
+    a_turn, a_directions, a_spread, a_factor = a
+    b_turn, b_directions, b_spread, b_factor = b
+    by_b, by_a, across = np.empty(3), np.empty(3), np.empty(3)
+    for i in range(len(a_directions)):
+        # the volume that two rays span with the baseline c, d_b . (c x d_a), and its derivative by either direction
+        _cross(baseline, a_directions[i], by_b)
+        b0 = by_b[0] * b_turn[0, 0] + by_b[1] * b_turn[0, 1] + by_b[2] * b_turn[0, 2]
+        b1 = by_b[0] * b_turn[1, 0] + by_b[1] * b_turn[1, 1] + by_b[2] * b_turn[1, 2]
+        for j in range(len(b_directions)):
+            direction = b_directions[j]
+            _cross(direction, baseline, by_a)
+            a0 = by_a[0] * a_turn[0, 0] + by_a[1] * a_turn[0, 1] + by_a[2] * a_turn[0, 2]
+            a1 = by_a[0] * a_turn[1, 0] + by_a[1] * a_turn[1, 1] + by_a[2] * a_turn[1, 2]
+            variance = 0.0
+            for k in range(2):
+                variance += (a0 * a_spread[i, 0, k] + a1 * a_spread[i, 1, k]) ** 2
+                variance += (b0 * b_spread[j, 0, k] + b1 * b_spread[j, 1, k]) ** 2
+            # a pixel that stays moves its ray against what moves a point's image
+            _cross(a_directions[i], direction, across)
+            for k in range(shift.shape[1]):
+                moves = across[0] * shift[0, k] + across[1] * shift[1, k] + across[2] * shift[2, k]
+                moves -= a0 * a_factor[i, 0, k] + a1 * a_factor[i, 1, k]
+                moves -= b0 * b_factor[j, 0, k] + b1 * b_factor[j, 1, k]
+                variance += moves * moves
+            volume = by_b[0] * direction[0] + by_b[1] * direction[1] + by_b[2] * direction[2]
+            distance[i, j] = volume / math.sqrt(variance)
+
+
+@compiled
+def _cross(a: FloatArray, b: FloatArray, product: FloatArray) -> None:
+    """Write the cross product (3,)."""
+    product[0] = a[1] * b[2] - a[2] * b[1]
+    product[1] = a[2] * b[0] - a[0] * b[2]
+    product[2] = a[0] * b[1] - a[1] * b[0]
+
+
 def _two_rays(geometry: RigRays, rays: Rays, a: int, b: int, pairs: Pairs, optimal: bool) -> FloatArray:
     """(n, 3) where two rays meet: after their optimal correction, or where they pass each other."""
     if not len(pairs.first):
         return np.zeros((0, 3))
-    flat_a, flat_b = rays.flat[pairs.first], rays.flat[pairs.second]
     first, second = rays.directions[pairs.first], rays.directions[pairs.second]
     if optimal:
-        both = [a, b]
-        focal, centre = geometry.focal[both], geometry.centre[both]
-        matrix, *epipoles = hartley_sturm.fundamental(
-            geometry.rotations[both], geometry.translations[both], focal, centre
-        )
+        matrix, *epipoles = geometry.epipolar
+        focal, centre = geometry.focal, geometry.centre
         one, other = hartley_sturm.correct(
-            matrix, (epipoles[0], epipoles[1]), flat_a * focal[0] + centre[0], flat_b * focal[1] + centre[1]
+            matrix,
+            (epipoles[0], epipoles[1]),
+            rays.flat[pairs.first] * focal[0] + centre[0],
+            rays.flat[pairs.second] * focal[1] + centre[1],
         )
         first = _directions(geometry, a, (one - centre[0]) / focal[0])
         second = _directions(geometry, b, (other - centre[1]) / focal[1])
-    # least squares over the two lengths: rays that meet meet there, others are nearest there
-    baseline = geometry.positions[b] - geometry.positions[a]
-    ff, fs, ss = (first * first).sum(axis=-1), (first * second).sum(axis=-1), (second * second).sum(axis=-1)
-    fb, sb = first @ baseline, second @ baseline
-    with np.errstate(divide="ignore", invalid="ignore"):
+    middle = np.empty((len(first), 3))
+    _meet(geometry.positions[a], geometry.positions[b], first, second, middle)
+    return middle
+
+
+@compiled
+def _meet(start: FloatArray, other: FloatArray, first: FloatArray, second: FloatArray, middle: FloatArray) -> None:
+    """Write the points (n, 3) half way between where rays are nearest: least squares over the two lengths.
+
+    Behind the cameras, and of parallel rays: NaN, which no range contains.
+    """
+    for n in range(len(first)):
+        ff = fs = ss = fb = sb = 0.0
+        for k in range(3):
+            baseline = other[k] - start[k]
+            ff += first[n, k] * first[n, k]
+            fs += first[n, k] * second[n, k]
+            ss += second[n, k] * second[n, k]
+            fb += first[n, k] * baseline
+            sb += second[n, k] * baseline
         determinant = ff * ss - fs * fs
         along, other_along = (ss * fb - fs * sb) / determinant, (fs * fb - ff * sb) / determinant
-    middle = geometry.positions[a] + along[:, None] * first
-    middle = 0.5 * (middle + geometry.positions[b] + other_along[:, None] * second)
-    # behind the cameras, parallel rays: NaN, which no range contains
-    good = (along > 0.0) & (other_along > 0.0)
-    return np.where(good[:, None], middle, np.nan)
+        for k in range(3):
+            ends = start[k] + along * first[n, k] + other[k] + other_along * second[n, k]
+            middle[n, k] = 0.5 * ends if along > 0.0 and other_along > 0.0 else math.nan
 
 
 def _directions(geometry: RigRays, camera: int, flat: FloatArray) -> FloatArray:
@@ -212,18 +266,64 @@ def _refined(
     geometry: RigRays, rays: Rays, members: IntArray, positions: FloatArray, steps: int
 ) -> tuple[FloatArray, FloatArray]:
     """Points (n, 3) after Gauss-Newton on reprojection errors with the centroids' weights, and covariance (n, 3, 3)."""
-    if not len(members):
-        return np.zeros((0, 3)), np.zeros((0, 3, 3))
-    weight = np.where((members >= 0)[:, :, None, None], rays.weight[members], 0.0)
-    flat = np.where((members >= 0)[:, :, None], rays.flat[members], 0.0)
-    for _ in range(steps):
-        made, by_point = _projected(geometry, positions)
-        weighted = by_point.transpose(0, 1, 3, 2) @ weight  # (n, c, 3, 2)
-        information = (weighted @ by_point).sum(axis=1)
-        gradient = (weighted @ (flat - made)[..., None]).sum(axis=1)
-        covariance = np.linalg.inv(information)
-        positions = positions + (covariance @ gradient)[:, :, 0]
+    positions, covariance = np.array(positions), np.empty((len(members), 3, 3))
+    pose = geometry.rotations, geometry.translations
+    _gauss_newton(*pose, rays.flat, rays.weight, members, steps, positions, covariance)
     return positions, covariance
+
+
+@compiled
+def _gauss_newton(
+    rotations: FloatArray,
+    translations: FloatArray,
+    flat: FloatArray,
+    weight: FloatArray,
+    members: IntArray,
+    steps: int,
+    positions: FloatArray,
+    covariance: FloatArray,
+) -> None:
+    """Move the positions (n, 3) by so many steps, and write their covariance (n, 3, 3) before the last."""
+    information, gradient, derivative = np.empty((3, 3)), np.empty(3), np.empty((2, 3))
+    for n in range(len(members)):
+        for _ in range(steps):
+            information[:], gradient[:] = 0.0, 0.0
+            for c in range(members.shape[1]):
+                ball = members[n, c]
+                if ball < 0:
+                    continue
+                turn, point = rotations[c], positions[n]
+                x = turn[0, 0] * point[0] + turn[0, 1] * point[1] + turn[0, 2] * point[2] + translations[c, 0]
+                y = turn[1, 0] * point[0] + turn[1, 1] * point[1] + turn[1, 2] * point[2] + translations[c, 1]
+                z = turn[2, 0] * point[0] + turn[2, 1] * point[1] + turn[2, 2] * point[2] + translations[c, 2]
+                x, y = x / z, y / z
+                for k in range(3):
+                    derivative[0, k] = (turn[0, k] - x * turn[2, k]) / z
+                    derivative[1, k] = (turn[1, k] - y * turn[2, k]) / z
+                x, y, w = flat[ball, 0] - x, flat[ball, 1] - y, weight[ball]
+                for i in range(3):
+                    one = derivative[0, i] * w[0, 0] + derivative[1, i] * w[1, 0]
+                    other = derivative[0, i] * w[0, 1] + derivative[1, i] * w[1, 1]
+                    gradient[i] += one * x + other * y
+                    for j in range(3):
+                        information[i, j] += one * derivative[0, j] + other * derivative[1, j]
+            _invert(information, covariance[n])
+            for i in range(3):
+                for j in range(3):
+                    positions[n, i] += covariance[n, i, j] * gradient[j]
+
+
+@compiled
+def _invert(matrix: FloatArray, inverse: FloatArray) -> None:
+    """Write the inverse of a symmetric matrix (3, 3)."""
+    a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
+    d, e, f = matrix[1, 1], matrix[1, 2], matrix[2, 2]
+    first, second, third = d * f - e * e, c * e - b * f, b * e - c * d
+    scale = 1.0 / (a * first + b * second + c * third)
+    inverse[0, 0], inverse[1, 1], inverse[2, 2] = first * scale, (a * f - c * c) * scale, (a * d - b * b) * scale
+    inverse[0, 1] = inverse[1, 0] = second * scale
+    inverse[0, 2] = inverse[2, 0] = third * scale
+    inverse[1, 2] = inverse[2, 1] = (b * c - a * e) * scale
 
 
 def _projected(geometry: RigRays, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
