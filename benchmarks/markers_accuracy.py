@@ -343,7 +343,7 @@ def calibration(job: tuple[int, int, int]) -> dict[str, Any]:
 def floor_of_angles(truth: Rig, bodies: tuple[Target, ...], tree: Tree, posture: Posture) -> dict[str, FloatArray]:
     """(n,) variance of each joint's angles by the noise of the centroids alone, everything else known (Cramer-Rao)."""
     rotations, translations = place(tree, posture)
-    derivative = differentiate(tree, posture, rotations, translations, False)
+    derivative = differentiate(tree, posture, rotations, False)
     bounds = np.array(
         [
             [bound(truth, body, turn, shift) for body, turn, shift in zip(bodies, some, others, strict=True)]

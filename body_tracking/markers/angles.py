@@ -18,11 +18,12 @@ from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import BoolArray, FloatArray
 from body_tracking.kinematics.euler import EulerAngles, EulerSequences
 from body_tracking.markers.chain import Chain
-from body_tracking.markers.joint_model import JointKind, turn_angles, turn_axes
-from body_tracking.markers.joint_tree import ROOT, Posture, differentiate, errors, first_posture, moved, place
+from body_tracking.markers.joint_model import SIZE, Joint, JointKind, turn_angles, turn_axes
+from body_tracking.markers.joint_tree import ROOT, Posture, first_posture, numbers_of
 from body_tracking.markers.joints import MISFIT_WARNING
 from body_tracking.markers.observations import TargetPose
 from body_tracking.markers.pose_table import PoseTable, PoseTableError, pose_table
+from body_tracking.markers.tree_loops import adjusted
 
 UNKNOWN: Final = 1.0
 """Radians: a coordinate with a larger standard deviation is not known: its target is not seen."""
@@ -121,23 +122,12 @@ class AngleEstimator:
         if not table.seen.any():
             raise PoseTableError(f"poses: none of a target of the chain ({', '.join(self._tree.targets)})")
         systematic = self._systematic(table, sensitivities, calibration)
-        posture = first_posture(self._tree, table, self._posture)
-        size = self._tree.size
-        for count in range(_ITERATIONS):
-            rotations, translations = place(self._tree, posture)
-            # the first step is never the last: those by the joints' parameters are not needed yet
-            derivative = differentiate(self._tree, posture, rotations, translations, count > 0)
-            white = (table.whitening @ derivative).reshape(-1, derivative.shape[-1])
-            error = (table.whitening @ errors(table, rotations, translations)[..., None]).reshape(-1)
-            covariance = np.asarray(np.linalg.inv(_information(white[:, :size])), dtype=np.float64)
-            step = covariance @ (white[:, :size].T @ error)
-            posture = moved(self._tree, posture, step[None])
-            if count > 0 and np.abs(step).max() < _CONVERGED:
-                break
-        self._posture = posture
-        # the last step is too small for derivatives to change by it
-        squares = float(((error - white[:, :size] @ step) ** 2).sum())
-        return self._stated(poses[0].stamp_ns, table, posture, (white, covariance, squares), systematic)
+        start = first_posture(self._tree, table, self._posture).arrays()
+        measured = table.rotations, table.translations, table.seen, table.whitening
+        limits = _LOOSE, _CONVERGED, _ITERATIONS
+        solution = adjusted(numbers_of(self._tree), start, measured, self._tree.size, *limits)
+        self._posture = Posture(start[0], start[1], tuple(start[2]))
+        return self._stated(poses[0].stamp_ns, table, self._posture, solution, systematic)
 
     def _systematic(
         self, table: PoseTable, sensitivities: Mapping[str, FloatArray] | None, calibration: FloatArray | None
@@ -265,8 +255,9 @@ class AngleEstimator:
         return gaps
 
 
-def _information(white: FloatArray) -> FloatArray:
-    """(size, size) of whitened derivatives (6 m, size), so that a coordinate that no target shows can be solved."""
-    information: FloatArray = white.T @ white
-    information.ravel()[:: len(information) + 1] += _LOOSE
-    return information
+def prepare() -> None:
+    """Compile the loops, or load them, before the first poses: two targets and a hinge."""
+    place, turn = np.zeros(3), np.eye(3)
+    joint = Joint("hinge", "parent", "child", JointKind.HINGE, turn, place, turn, place, np.zeros((SIZE, SIZE)))
+    poses = [TargetPose(name, 0, "", turn, place, 1e-6 * np.eye(6), np.arange(3), 0.0) for name in ("parent", "child")]
+    AngleEstimator(Chain((joint,), joint.covariance, np.zeros((SIZE, 0)))).estimate(poses)

@@ -143,7 +143,7 @@ def settled(tree: Tree, posture: Posture, poses: PoseTable) -> Posture:
     for _ in range(_SETTLING):
         rotations, translations = place(tree, posture)
         error = errors(poses, rotations, translations)
-        derivative = differentiate(tree, posture, rotations, translations, False)
+        derivative = differentiate(tree, posture, rotations, False)
         white = (poses.whitening @ derivative).reshape(len(poses), -1, tree.size)
         residual = (poses.whitening @ error[..., None]).reshape(len(poses), -1, 1)
         information = white.swapaxes(-1, -2) @ white
@@ -313,7 +313,7 @@ def _derivatives(
     tree: Tree, posture: Posture, poses: PoseTable, directions: FloatArray, error: FloatArray | None
 ) -> tuple[FloatArray, FloatArray]:
     """(n, 6 m, f) and (n, 6 m, p) derivatives of the whitened poses by each frame's posture and by the parameters."""
-    derivative = differentiate(tree, posture, *place(tree, posture), True)
+    derivative = differentiate(tree, posture, place(tree, posture)[0], True)
     if error is not None:
         # log(E exp(-w)) = log(E) - Jr^-1(log E) w
         derivative[:, :, 3:] = so3.right_jacobian_inverse(error[..., 3:]) @ derivative[:, :, 3:]

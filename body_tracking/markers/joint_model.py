@@ -178,15 +178,6 @@ def nearest_turns(kind: JointKind, rotations: FloatArray) -> FloatArray:
     return about_z(angles[:, 0]) @ _QUARTER @ about_z(angles[:, 1])
 
 
-def step_turns(kind: JointKind, turns: FloatArray, steps: FloatArray) -> FloatArray:
-    """(n, 3, 3) turns further by (n, d) radians about :func:`turn_axes`."""
-    if kind is JointKind.BALL:
-        result: FloatArray = so3.quat_to_matrix(so3.exp(steps)) @ turns
-        return result
-    result = about_z(steps[:, 0]) @ turns
-    return result @ about_z(steps[:, 1]) if kind is JointKind.UNIVERSAL else result
-
-
 def about_z(angles: FloatArray) -> FloatArray:
     """(n, 3, 3) rotations about z by (n,) radians."""
     result = np.zeros((len(angles), 3, 3))

@@ -1,27 +1,26 @@
 """A tree of targets that joints connect: its posture, and how that depends on coordinates and parameters.
 
 The coordinates of a posture are the root target's pose (translation, then a rotation w: ``exp(w) @ rotation``) and
-those of each joint, in their order (:func:`body_tracking.markers.joint_model.step_turns`).
+those of each joint, in their order: turns about :func:`body_tracking.markers.joint_model.turn_axes`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
 
-from body_tracking.core import so3
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import FloatArray
+from body_tracking.markers import tree_loops
 from body_tracking.markers.joint_model import (
     SIZE,
     Joint,
     JointKind,
     nearest_turns,
-    step_turns,
-    turn_axes,
 )
 from body_tracking.markers.pose_table import PoseTable
 
@@ -69,6 +68,10 @@ class Posture:
     rotation: FloatArray
     translation: FloatArray
     turns: tuple[FloatArray, ...]
+
+    def arrays(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Copies of the three, the turns as (j, n, 3, 3)."""
+        return np.array(self.rotation, order="C"), np.array(self.translation, order="C"), np.stack(self.turns)
 
 
 def tree_of(joints: Sequence[Joint]) -> Tree:
@@ -143,27 +146,34 @@ def _zero(kind: JointKind) -> FloatArray:
     return np.eye(3)[None]
 
 
+@lru_cache(maxsize=8)
+def numbers_of(tree: Tree) -> tree_loops.Numbers:
+    """The numbers of a tree, as loops need them."""
+    joints = tree.joints
+    return (
+        np.array(tree.parents),
+        np.array([joint.kind.coordinates for joint in joints]),
+        np.array([where.start for where in tree.slices]),
+        np.stack([joint.parent_rotation for joint in joints]),
+        np.stack([joint.parent_centre for joint in joints]),
+        np.stack([joint.child_rotation for joint in joints]),
+        np.stack([joint.child_centre for joint in joints]),
+    )
+
+
 def place(tree: Tree, posture: Posture) -> tuple[FloatArray, FloatArray]:
     """Rotations (n, m, 3, 3) and translations (n, m, 3) of the targets of postures (Gaschler eq. 5.20)."""
-    rotations, translations = [posture.rotation], [posture.translation]
-    for joint, parent, turns in zip(tree.joints, tree.parents, posture.turns, strict=True):
-        rotation = rotations[parent] @ (joint.parent_rotation @ turns @ joint.child_rotation.T)
-        centre = translations[parent] + rotations[parent] @ joint.parent_centre
-        rotations.append(rotation)
-        translations.append(centre - rotation @ joint.child_centre)
-    return np.stack(rotations, axis=1), np.stack(translations, axis=1)
+    n, m = len(posture.rotation), len(tree.targets)
+    rotations, translations = np.empty((n, m, 3, 3)), np.empty((n, m, 3))
+    tree_loops.place(numbers_of(tree), *posture.arrays(), rotations, translations)
+    return rotations, translations
 
 
 def moved(tree: Tree, posture: Posture, steps: FloatArray) -> Posture:
     """Postures further by (n, size) steps of their coordinates."""
-    return Posture(
-        so3.quat_to_matrix(so3.exp(steps[:, 3:6])) @ posture.rotation,
-        posture.translation + steps[:, :3],
-        tuple(
-            step_turns(joint.kind, turns, steps[:, where])
-            for joint, turns, where in zip(tree.joints, posture.turns, tree.slices, strict=True)
-        ),
-    )
+    rotation, translation, turns = posture.arrays()
+    tree_loops.moved(numbers_of(tree), np.ascontiguousarray(steps), rotation, translation, turns)
+    return Posture(rotation, translation, tuple(turns))
 
 
 def reseated(tree: Tree, posture: Posture, joints: Sequence[Joint]) -> tuple[Tree, Posture]:
@@ -177,47 +187,28 @@ def reseated(tree: Tree, posture: Posture, joints: Sequence[Joint]) -> tuple[Tre
     return tree.with_joints(joints), replace(posture, turns=turns)
 
 
-def differentiate(
-    tree: Tree, posture: Posture, rotations: FloatArray, translations: FloatArray, parameters: bool
-) -> FloatArray:
+def differentiate(tree: Tree, posture: Posture, rotations: FloatArray, parameters: bool) -> FloatArray:
     """Derivatives of the targets' poses.
 
     Args:
         tree: with j joints.
         posture: n of them.
         rotations: of :func:`place`.
-        translations: of :func:`place`.
         parameters: whether those of the joints are wanted.
 
     Returns:
         (n, m, 6, size + 12 j) of translation and rotation (w of ``exp(w) @ rotation``) by the coordinates, then by the
         parameters of each joint as in :attr:`Joint.covariance`; (n, m, 6, size) without parameters.
     """
-    n, count = len(posture.rotation), len(tree.targets)
-    result = np.zeros((n, count, 6, tree.size + (SIZE * len(tree.joints) if parameters else 0)))
-    result[:, 0, range(6), range(6)] = 1.0
-    for index, (joint, parent, turns) in enumerate(zip(tree.joints, tree.parents, posture.turns, strict=True)):
-        before, child = rotations[:, parent], index + 1
-        frame = before @ joint.parent_rotation
-        by_parent, by_child = result[:, parent], result[:, child]
-        by_child[:, 3:] = by_parent[:, 3:]
-        by_child[:, 3:, tree.slices[index]] = frame @ turn_axes(joint.kind, turns)
-        if parameters:
-            start = tree.size + SIZE * index
-            by_child[:, 3:, start + 3 : start + 6] = before
-            by_child[:, 3:, start + 9 : start + 12] = -rotations[:, child]
-        # centre = parent's translation + parent_arm = child's translation + child_arm
-        parent_arm = so3.skew(before @ joint.parent_centre)
-        child_arm = so3.skew(rotations[:, child] @ joint.child_centre)
-        by_child[:, :3] = by_parent[:, :3] - parent_arm @ by_parent[:, 3:] + child_arm @ by_child[:, 3:]
-        if parameters:
-            by_child[:, :3, start : start + 3] += before
-            by_child[:, :3, start + 6 : start + 9] -= rotations[:, child]
+    width = tree.size + (SIZE * len(tree.joints) if parameters else 0)
+    result = np.zeros((*rotations.shape[:2], 6, width))
+    turns = posture.arrays()[2]
+    tree_loops.differentiate(numbers_of(tree), turns, rotations, tree.size, parameters, result)
     return result
 
 
 def errors(poses: PoseTable, rotations: FloatArray, translations: FloatArray) -> FloatArray:
     """(n, m, 6) translation and rotation (w of ``exp(w) @ rotation``) from the tree's poses to those that are seen."""
-    turn = so3.rotation_vectors(poses.rotations @ rotations.swapaxes(-1, -2))
-    result: FloatArray = np.concatenate([poses.translations - translations, turn], axis=-1) * poses.seen[..., None]
+    result = np.empty((*rotations.shape[:2], 6))
+    tree_loops.errors(poses.rotations, poses.translations, poses.seen, rotations, translations, result)
     return result

@@ -164,8 +164,9 @@ def make_rays(geometry: RigRays, images: Sequence[ImageBalls]) -> Rays:
     present = [image for image in sorted_images if image is not None]
     counts = [0 if image is None else len(image.pixels) for image in sorted_images]
     first = [0, *np.cumsum(counts).tolist()]
-    pixels = np.concatenate([image.pixels for image in present]) if present else np.zeros((0, 2))
-    covariance = np.concatenate([image.covariance for image in present]) if present else np.zeros((0, 2, 2))
+    # in one order, for a compiled loop exists for each that it is given
+    pixels = np.ascontiguousarray(np.concatenate([np.zeros((0, 2)), *(image.pixels for image in present)]))
+    covariance = np.ascontiguousarray(np.concatenate([np.zeros((0, 2, 2)), *(image.covariance for image in present)]))
     cameras = np.repeat(np.arange(len(counts)), counts)
     size, unknowns = len(pixels), geometry.flat_factor.shape[-1]
     flat, directions, flat_factor = np.empty((size, 2)), np.empty((size, 3)), np.empty((size, 2, unknowns))

@@ -15,7 +15,7 @@ from body_tracking.core.joint_angles import JointAngles
 from body_tracking.core.parameters import Parameter, Value, fields_of, parameters_from
 from body_tracking.core.qos import LATCHED, RELIABLE, Qos
 from body_tracking.core.skeleton import NANOSECONDS
-from body_tracking.markers import detection, setup, tracking, triangulation
+from body_tracking.markers import angles, detection, setup, tracking, triangulation
 from body_tracking.markers.angles import AngleEstimator, ChainAngles
 from body_tracking.markers.chain_files import load_chain
 from body_tracking.markers.codecs import Balls, CameraImage, Frames, PoseOfTarget, SpacePoints
@@ -317,6 +317,7 @@ class AnglesOfTargetsStage(Stage):
         self._shapes = {target.name: target for target in targets}
         self._angles = AngleEstimator(chain)
         triangulation.prepare()  # its derivatives, by which errors of the calibration become those of angles
+        angles.prepare()
         self._sets: FrameSets[TargetPose] = FrameSets(
             chain.targets, 0, round(float(str(values["max_wait"])) * NANOSECONDS)
         )
@@ -351,10 +352,9 @@ class AnglesOfTargetsStage(Stage):
             sensitivities = calibration_effects(self._rig, self._shapes, list(poses.values()))
             calibration = None if self._rig is None else self._rig.covariance
             found = self._angles.estimate(tuple(poses.values()), sensitivities, calibration)
-            angles = with_rates(found, self._last)
-            self._last = angles
+            self._last = with_rates(found, self._last)
             for port in self.outputs:
-                yield Output(port.topic, angles, angles.stamp_ns)
+                yield Output(port.topic, self._last, self._last.stamp_ns)
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -363,5 +363,5 @@ class AnglesOfTargetsStage(Stage):
 
 def prepare() -> None:
     """Compile the loops of all stages, or load them."""
-    for each in (detection, triangulation, tracking):
+    for each in (detection, triangulation, tracking, angles):
         each.prepare()
