@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from body_tracking.core import so3
+from body_tracking.core.compiled import compiled
 from body_tracking.core.skeleton import FloatArray, IntArray
 from body_tracking.markers import projection
 from body_tracking.markers.observations import ImageBalls, Points, TargetPose
@@ -52,17 +53,50 @@ def pose_sensitivity(rig: Rig, target: Target, pose: TargetPose) -> FloatArray:
 def pose_sensitivities(rig: Rig, targets: Mapping[str, Target], poses: Sequence[TargetPose]) -> dict[str, FloatArray]:
     """:func:`pose_sensitivity` of several targets at once, by their names."""
     starts, by_pose, points = _balls(targets, poses)
+    firsts = np.append(starts, len(points))
     information, pull, start = np.zeros((len(poses), 6, 6)), np.zeros((len(poses), 6, rig.size)), 0
     for camera, rotation, translation in zip(rig.cameras, rig.rotations, rig.translations, strict=True):
         seen = projection.project(camera, rotation, translation, points)
-        by_ball = seen.by_point @ by_pose
-        turned_back = by_ball.swapaxes(1, 2)
-        end = start + projection.size(camera)
-        information += np.add.reduceat(turned_back @ by_ball, starts)
-        pull[:, :, start:end] = np.add.reduceat(turned_back @ seen.by_parameters, starts)
-        start = end
+        _collect(firsts, by_pose, seen.by_point, seen.by_parameters, start, information, pull)
+        start += projection.size(camera)
     moves = np.asarray(-np.linalg.solve(information, pull), dtype=np.float64)
     return {pose.name: each for pose, each in zip(poses, moves, strict=True)}
+
+
+@compiled
+def _collect(
+    firsts: IntArray,
+    by_pose: FloatArray,
+    by_point: FloatArray,
+    by_parameters: FloatArray,
+    start: int,
+    information: FloatArray,
+    pull: FloatArray,
+) -> None:
+    """Add the normal equations of a camera's pixels: poses (t, 6, 6), and (t, 6, p) by the rig's parameters.
+
+    Args:
+        firsts: (t + 1,) first ball of each target.
+        by_pose: (b, 3, 6) derivative of the balls by their poses,
+        by_point: (b, 2, 3) of the pixels by the balls,
+        by_parameters: (b, 2, q) and by the camera's own parameters,
+        start: of which this is the first in the rig.
+        information: is added to.
+        pull: is added to.
+    """
+    derivative = np.empty(6)
+    for target in range(len(firsts) - 1):
+        for ball in range(firsts[target], firsts[target + 1]):
+            for axis in range(2):
+                for i in range(6):
+                    derivative[i] = 0.0
+                    for k in range(3):
+                        derivative[i] += by_point[ball, axis, k] * by_pose[ball, k, i]
+                for i in range(6):
+                    for j in range(6):
+                        information[target, i, j] += derivative[i] * derivative[j]
+                    for j in range(by_parameters.shape[2]):
+                        pull[target, i, start + j] += derivative[i] * by_parameters[ball, axis, j]
 
 
 def calibration_effects(

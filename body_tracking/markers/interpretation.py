@@ -247,7 +247,7 @@ def _rivals(
     """Whether another way to see the target, at so much more cost, makes it uncertain."""
     if other is None:
         return more < MARGIN
-    if _same(own, other):
+    if other is own or _same(own, other):
         return False
     # of the same points, the likelihoods tell; points at another place need an explanation, too
     shared = len(set(own.assignment) & set(other.assignment) - {-1})

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from body_tracking.core import so3
 from body_tracking.core.camera import Camera
 from body_tracking.core.compiled import compiled
 from body_tracking.core.skeleton import BoolArray, FloatArray
@@ -127,14 +126,49 @@ def _by_lens(
 
 def project(camera: Camera, rotation: FloatArray, translation: FloatArray, points: FloatArray) -> Projection:
     """Points (n, 3) of the rig's frame as a camera of the rig sees them, with derivatives."""
+    count, lens = len(points), LENS + len(camera.distortion)
     turned = points @ rotation.T
+    pixels, by_flat = np.empty((count, 2)), np.empty((count, 2, 2))
+    by_parameters, by_point = np.empty((count, 2, lens + POSE)), np.empty((count, 2, 3))
     inside = turned + translation
-    depth = np.where(inside[:, 2] > 0.0, inside[:, 2], np.nan)
-    flat = inside[:, :2] / depth[:, None]
-    pixels, by_flat, lens = by_lens(camera, flat)
-    # eq. 4.3 of Gaschler: x/z, y/z
-    by_inside = np.empty((len(points), 2, 3))
-    by_inside[:, :, :2] = by_flat / depth[:, None, None]
-    by_inside[:, :, 2] = -(by_flat @ flat[:, :, None])[:, :, 0] / depth[:, None]
-    pose = np.concatenate([-(by_inside @ so3.skew(turned)), by_inside], axis=-1)
-    return Projection(pixels, np.concatenate([lens, pose], axis=-1), by_inside @ rotation)
+    flat = inside[:, :2] / np.where(inside[:, 2:] > 0.0, inside[:, 2:], np.nan)
+    matrix = np.ascontiguousarray(camera.matrix)
+    _by_lens(matrix, camera.distortion, flat, pixels, by_flat, by_parameters)
+    _by_pose(np.ascontiguousarray(rotation), turned, inside, flat, by_flat, by_parameters, by_point)
+    return Projection(pixels, by_parameters, by_point)
+
+
+@compiled
+def _by_pose(
+    rotation: FloatArray,
+    turned: FloatArray,
+    inside: FloatArray,
+    flat: FloatArray,
+    by_flat: FloatArray,
+    by_parameters: FloatArray,
+    by_point: FloatArray,
+) -> None:
+    """Write the derivatives of pixels by the pose, the last six of (n, 2, q), and by the points (n, 2, 3).
+
+    Args:
+        rotation: (3, 3) of the camera.
+        turned: (n, 3) points turned by it,
+        inside: (n, 3) and in the camera's frame.
+        flat: (n, 2) x/z and y/z.
+        by_flat: (n, 2, 2) derivative of the pixels by these.
+        by_parameters: is written.
+        by_point: is written.
+    """
+    last = by_parameters.shape[2] - POSE
+    for n in range(len(flat)):
+        (x, y), (u, v, w) = flat[n], turned[n]
+        depth = inside[n, 2] if inside[n, 2] > 0.0 else np.nan
+        for axis in range(2):
+            # eq. 4.3 of Gaschler: x/z, y/z
+            a, b = by_flat[n, axis, 0] / depth, by_flat[n, axis, 1] / depth
+            c = -(a * x + b * y)
+            row = by_parameters[n, axis]
+            row[last], row[last + 1], row[last + 2] = c * v - b * w, a * w - c * u, b * u - a * v
+            row[last + 3], row[last + 4], row[last + 5] = a, b, c
+            for k in range(3):
+                by_point[n, axis, k] = a * rotation[0, k] + b * rotation[1, k] + c * rotation[2, k]

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from body_tracking.core.compiled import compiled
+from body_tracking.core.compiled_linear import inverse_of, whitening_of
 from body_tracking.core.compiled_so3 import turn_between, turned
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray
 from body_tracking.markers.observations import Points, TargetPose
@@ -70,25 +71,11 @@ class Track:
 
     def updated(self, pose: tuple[FloatArray, FloatArray, FloatArray], stamp_ns: int) -> Track:
         """With a pose as a measurement, rotation, translation, covariance: Kalman's update in Joseph's form."""
-        # numpy's: these few calls take 0.1 ms, as a loop they take the compiler ten seconds
-        gain = np.linalg.solve(self.covariance[:6, :6] + pose[2], self.covariance[:6]).T
-        correction = gain @ _innovation(self.rotation, self.translation, *pose[:2])
-        left = np.eye(12)
-        left[:, :6] -= gain
-        covariance = left @ self.covariance @ left.T + gain @ pose[2] @ gain.T
-        return Track(
-            turned(correction[3:6], self.rotation),
-            self.translation + correction[:3],
-            self.velocity + correction[6:],
-            # rounding errors that are not symmetrical would grow from frame to frame
-            0.5 * (covariance + covariance.T),
-            stamp_ns,
-        )
+        return Track(*_updated(*self._numbers, *pose), stamp_ns)
 
     def distance(self, pose: tuple[FloatArray, FloatArray, FloatArray]) -> float:
-        """Squared Mahalanobis distance of a pose from the predicted one."""
-        innovation = _innovation(self.rotation, self.translation, *pose[:2])
-        return float(innovation @ np.linalg.solve(self.covariance[:6, :6] + pose[2], innovation))
+        """Squared Mahalanobis distance of a pose from the predicted one; infinity where its covariance is invalid."""
+        return float(_distance(self.rotation, self.translation, self.covariance, *pose))
 
     def gates(self, target: Target, points: Points) -> BoolArray:
         """(k, n) whether a point may be a ball of the target, by where the ball is expected."""
@@ -128,12 +115,81 @@ def _predicted(
     return turned(step[3:], rotation), translation + step[:3], velocity, moved
 
 
+@compiled
 def _innovation(
     rotation: FloatArray, translation: FloatArray, measured_rotation: FloatArray, measured_translation: FloatArray
 ) -> FloatArray:
     """(6,) from the predicted to the measured pose."""
-    turn = turn_between(rotation, measured_rotation)
-    return np.concatenate([measured_translation - translation, turn])
+    result = np.empty(6)
+    result[:3] = measured_translation - translation
+    result[3:] = turn_between(rotation, measured_rotation)
+    return result
+
+
+@compiled
+def _distance(
+    rotation: FloatArray,
+    translation: FloatArray,
+    covariance: FloatArray,
+    measured_rotation: FloatArray,
+    measured_translation: FloatArray,
+    noise: FloatArray,
+) -> float:
+    """:meth:`Track.distance`."""
+    whitening = np.empty((6, 6))
+    if not whitening_of(covariance[:6, :6] + noise, whitening):
+        return math.inf
+    innovation = _innovation(rotation, translation, measured_rotation, measured_translation)
+    distance = 0.0
+    for i in range(6):
+        white = 0.0
+        for j in range(i + 1):
+            white += whitening[i, j] * innovation[j]
+        distance += white * white
+    return distance
+
+
+@compiled
+def _updated(
+    rotation: FloatArray,
+    translation: FloatArray,
+    velocity: FloatArray,
+    covariance: FloatArray,
+    measured_rotation: FloatArray,
+    measured_translation: FloatArray,
+    noise: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """The numbers of a track with a measured pose and its covariance (6, 6): :meth:`Track.updated`."""
+    inverse, gain, left = np.empty((6, 6)), np.empty((12, 6)), np.empty((12, 12))
+    inverse_of(covariance[:6, :6] + noise, inverse)
+    innovation = _innovation(rotation, translation, measured_rotation, measured_translation)
+    correction, result = np.zeros(12), np.empty((12, 12))
+    for i in range(12):
+        for j in range(6):
+            gain[i, j] = 0.0
+            for k in range(6):
+                gain[i, j] += covariance[i, k] * inverse[k, j]
+            correction[i] += gain[i, j] * innovation[j]
+    for i in range(12):  # (1 - K H) P
+        for j in range(12):
+            left[i, j] = covariance[i, j]
+            for k in range(6):
+                left[i, j] -= gain[i, k] * covariance[k, j]
+    for i in range(12):  # (1 - K H) P (1 - K H)' + K R K', symmetrical in spite of rounding
+        for j in range(i + 1):
+            value = left[i, j]
+            for k in range(6):
+                mixed = -left[i, k]
+                for m in range(6):
+                    mixed += gain[i, m] * noise[m, k]
+                value += mixed * gain[j, k]
+            result[i, j] = result[j, i] = value
+    return (
+        turned(correction[3:6], rotation),
+        translation + correction[:3],
+        velocity + correction[6:],
+        result,
+    )
 
 
 @compiled

@@ -140,28 +140,52 @@ class TargetTracker:
     def _candidates(self, points: Points, until: Deadline) -> dict[str, list[Candidate]]:
         """Ways to see the tracked targets near where they are expected."""
         gates = {name: track.gates(self._targets[name], points) for name, track in self._tracks.items()}
+        candidates = self._obvious(points, gates, until)
+        gates = {name: gate for name, gate in gates.items() if name not in candidates}
         near = np.zeros(len(points.positions), dtype=bool)
         for gate in gates.values():
             near |= gate.any(axis=0)
         if not near.any():
-            return {}
+            return candidates
         rows = np.flatnonzero(near)
         reach = max(float(shape.distances.max() + shape.tolerance.max()) for shape in self._recogniser.shapes.values())
         pairs = near_pairs(points.positions[rows], points.covariance[rows], reach)
         pairs = Pairs(rows[pairs.first], rows[pairs.second], pairs.low, pairs.high)
         searches = {name: self._search(name, pairs, gate, until) for name, gate in gates.items()}
-        candidates: dict[str, list[Candidate]] = {name: [] for name in searches}
         # one ball of each may be hidden; of targets that are not found so, one more each time
         fewest = {name: max(FEWEST, len(self._targets[name].points) - 1) for name in searches}
         left = list(searches)
         while left:
             found = [(self._targets[name], list(searches[name](fewest[name]))) for name in left]
             for name, fits in zip(left, fitted_together(found, points, until), strict=True):
-                expected = [each for fit in fits if (each := _expected(self._tracks[name], fit)) is not None]
-                candidates[name] = sorted(expected, key=lambda candidate: candidate.cost)
+                candidates[name] = self._expected(name, fits)
                 fewest[name] -= 1
             left = [name for name in left if not candidates[name] and fewest[name] >= FEWEST]
         return candidates
+
+    def _obvious(self, points: Points, gates: dict[str, BoolArray], until: Deadline) -> dict[str, list[Candidate]]:
+        """The targets of which one ball at most is hidden, and of no other has another point within its gate.
+
+        Where the points fit, there is no other way to see the target, and nothing to search.
+        """
+        found = {}
+        for name, gate in gates.items():
+            balls = gate.sum(axis=1)
+            if balls.max(initial=0) == 1 and balls.sum() >= max(FEWEST, len(gate) - 1) and gate.sum(axis=0).max() == 1:
+                found[name] = tuple(np.where(balls == 1, gate.argmax(axis=1), -1).tolist())
+        fits = fitted_together([(self._targets[name], [each]) for name, each in found.items()], points, until)
+        expected = {name: self._expected(name, each) for name, each in zip(found, fits, strict=True)}
+        return {name: each for name, each in expected.items() if each}
+
+    def _expected(self, name: str, fits: list[Candidate]) -> list[Candidate]:
+        """Those within the gate of the prediction, with the cost of their distance from it, the likeliest first."""
+        distances = [self._tracks[name].distance(_pose(fit)) for fit in fits]
+        expected = [
+            replace(fit, cost=fit.cost + distance)
+            for fit, distance in zip(fits, distances, strict=True)
+            if distance <= _INNOVATION_GATE
+        ]
+        return sorted(expected, key=lambda candidate: candidate.cost)
 
     def _search(
         self, name: str, pairs: Pairs, gate: BoolArray, until: Deadline
@@ -205,12 +229,6 @@ def prepare() -> None:
 
 def _pose(candidate: Candidate) -> tuple[FloatArray, FloatArray, FloatArray]:
     return candidate.rotation, candidate.translation, candidate.covariance
-
-
-def _expected(track: Track, candidate: Candidate) -> Candidate | None:
-    """The candidate with the cost of its distance from the prediction; None outside of the gate."""
-    distance = track.distance(_pose(candidate))
-    return replace(candidate, cost=candidate.cost + distance) if distance <= _INNOVATION_GATE else None
 
 
 def _believed(target: Target, points: Points, candidate: Candidate, track: Track) -> bool:
