@@ -12,7 +12,7 @@ from body_tracking.core.compiled import compiled
 from body_tracking.core.skeleton import FloatArray, IntArray
 from body_tracking.markers import projection
 from body_tracking.markers.observations import ImageBalls, Points, TargetPose
-from body_tracking.markers.rig import Rig
+from body_tracking.markers.rig import Rig, parallel_cameras
 from body_tracking.markers.spheres import sphere_centre_correction
 from body_tracking.markers.targets import Target
 
@@ -152,3 +152,10 @@ def _balls(targets: Mapping[str, Target], poses: Sequence[TargetPose]) -> tuple[
     by_pose = np.concatenate([np.broadcast_to(np.eye(3), (len(arms), 3, 3)), -so3.skew(arms)], axis=-1)
     points = arms + np.repeat([pose.translation for pose in poses], counts, axis=0)
     return np.cumsum([0, *counts[:-1]]), by_pose, points
+
+
+def prepare() -> None:
+    """Compile the loops, or load them: a target a metre before two cameras."""
+    target = Target("", np.eye(3), np.zeros((9, 9)))
+    place = np.array([0.0, 0.0, 1.0])
+    pose_sensitivity(parallel_cameras(), target, TargetPose("", 0, "", np.eye(3), place, np.eye(6), np.arange(3), 0.0))

@@ -8,20 +8,28 @@ threshold, so that the threshold cuts nothing off. What is not the image of one 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.parameters import check_fields, number_field
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
 from body_tracking.markers.discs import MOST_DISCS, Discs, cut_by_border, explain
 from body_tracking.markers.observations import ImageBalls
-from body_tracking.markers.regions import Components, Regions, Shapes, histogram, regions_of, shapes_of
+from body_tracking.markers.regions import (
+    Components,
+    Regions,
+    Shapes,
+    background_of,
+    groups_of,
+    histogram,
+    regions_of,
+    shapes_of,
+)
 from body_tracking.markers.spheres import sphere_centre_correction as sphere_centre_correction
 
 _ROWS: Final = 4
@@ -156,9 +164,14 @@ def detect(
     regions = regions_of(image, components, kept, background, saturation, settings.full_well)
     shapes = shapes_of(regions, settings.floor)
     odd, cut = _odd(shapes, settings), ~components.inside[kept]
+    groups = groups_of(shapes.pixels, shapes.areas, _APART)
+    members = np.bincount(groups, minlength=len(groups))
+    # most regions are the image of one ball by itself
+    plain = (members[groups] == 1) & ~odd & ~cut
     found: list[_Ball] = []
     dropped = len(areas) - 1 - len(kept)
-    for group in _groups(shapes):
+    for first in np.flatnonzero((members > 0) & ~plain).tolist():
+        group = np.flatnonzero(groups == first)
         balls = _explained(regions, shapes, group, _TOGETHER) if 1 < len(group) <= MOST_DISCS else []
         for region in group if not balls else []:
             if cut[region]:
@@ -166,16 +179,16 @@ def detect(
             elif odd[region]:
                 alone = _explained(regions, shapes, np.array([region]), settings.misfit)
             else:
-                covariance = shapes.covariance[region]
-                if len(group) > 1:
-                    covariance = covariance + _DISTURBED**2 * np.eye(2)
+                covariance = shapes.covariance[region] + _DISTURBED**2 * np.eye(2)
                 alone = [(shapes.pixels[region], float(shapes.areas[region]), covariance)]
             dropped += not alone
             balls += alone
         found += balls
-    if not found:
-        return replace(none, dropped=dropped)
-    centres, sizes, covariances = (np.array(part) for part in zip(*found, strict=True))
+    centres, sizes, covariances = shapes.pixels[plain], shapes.areas[plain], shapes.covariance[plain]
+    if found:
+        centres = np.concatenate([centres, [ball[0] for ball in found]])
+        sizes = np.concatenate([sizes, [ball[1] for ball in found]])
+        covariances = np.concatenate([covariances, [ball[2] for ball in found]])
     return ImageBalls(stamp_ns, camera, centres, sizes, covariances, dropped)
 
 
@@ -210,13 +223,8 @@ class _Histogram:
     def of(cls, image: NDArray[Any], settings: DetectionSettings) -> _Histogram:
         """The threshold between two quantiles of the brightness (Gaschler 2011, figure 3.1, eq. 3.1)."""
         counts = histogram(image, _ROWS, np.iinfo(image.dtype).max + 1)
-        total = np.cumsum(counts)
-        quantiles = np.array([settings.dark, settings.bright]) * total[-1]
-        dark, bright = np.searchsorted(total, quantiles).tolist()
-        levels = np.arange(dark + 1, dtype=np.float64)
-        counts = counts[: dark + 1].astype(np.float64)
-        background = float(levels @ counts / counts.sum())
-        variance = max(float((levels - background) ** 2 @ counts / counts.sum()), _QUANTISATION)
+        dark, bright, background, variance = background_of(counts, settings.dark, settings.bright)
+        variance = max(variance, _QUANTISATION)
         by_quantiles = dark + settings.lower * (bright - dark)
         threshold = int(max(by_quantiles, background + settings.noise * np.sqrt(variance)))
         return cls(threshold, background, variance)
@@ -228,17 +236,6 @@ def _odd(shapes: Shapes, settings: DetectionSettings) -> BoolArray:
     noise = np.sqrt(np.pi * (shapes.covariance[:, 0, 0] + shapes.covariance[:, 1, 1]) / areas)
     elongated = shapes.elongation > settings.elongation + _ELONGATION_NOISE * noise
     return np.asarray(elongated | (shapes.fill < settings.fill * (1.0 - _LOST / areas)))
-
-
-def _groups(shapes: Shapes) -> list[IntArray]:
-    """Regions that are so near to each other that they must be measured together."""
-    pixels, radii = shapes.pixels, np.sqrt(shapes.areas / np.pi)
-    apart = np.linalg.norm(pixels[:, None] - pixels, axis=2) - radii[:, None] - radii
-    near = apart < _APART
-    if near.sum() == len(near):
-        return list(np.arange(len(near))[:, None])
-    count, group = connected_components(near, directed=False)
-    return [np.flatnonzero(group == index) for index in range(count)]
 
 
 def _explained(regions: Regions, shapes: Shapes, members: IntArray, misfit: float) -> list[_Ball]:

@@ -55,8 +55,9 @@ class Components:
 
         Gaschler (2011): section 3.1.3.
         """
-        runs, areas, inside = _components(np.flatnonzero(image.ravel() > threshold), *image.shape)
-        return cls(runs, areas, inside)
+        bright = image.ravel() > threshold
+        words = np.flatnonzero(bright[: bright.size // 8 * 8].view(np.uint64))  # most have no bright pixel
+        return cls(*_components(bright, words, *image.shape))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,12 +117,10 @@ def regions_of(
         saturation: brightness at which the sensor saturates.
         full_well: electrons of a saturated pixel.
     """
-    owner, wide = (np.zeros(image.shape, dtype=np.uint16) for _ in range(2))
-    _spread(components.runs, owner, wide)
     boxes = _boxes(components.runs, kept, len(components.areas), image.shape[0], image.shape[1])
     room = int(((boxes[:, 1] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 2])).sum())
     pixels, first, ceilings = np.empty((4, room)), np.zeros(len(kept) + 1, dtype=np.int64), np.empty(len(kept))
-    _gather(image, owner, wide, kept, boxes, background, saturation, full_well, pixels, first, ceilings)
+    _gather(image, components.runs, kept, boxes, background, saturation, full_well, pixels, first, ceilings)
     return Regions(first, pixels[:, : first[-1]], ceilings)
 
 
@@ -153,6 +152,30 @@ def histogram(image: NDArray[Any], step: int, levels: int) -> IntArray:
 
 
 @compiled
+def background_of(counts: IntArray, dark: float, bright: float) -> tuple[int, int, float, float]:
+    """Two quantiles of a histogram (levels,), and mean and variance of the levels up to the first."""
+    total = 0
+    for level in range(len(counts)):
+        total += counts[level]
+    first, second, passed = -1, -1, 0
+    number = sum1 = sum2 = 0.0
+    for level in range(len(counts)):
+        passed += counts[level]
+        if first < 0:
+            number += counts[level]
+            sum1 += level * counts[level]
+            if passed >= dark * total:
+                first = level
+        if passed >= bright * total:
+            second = level
+            break
+    mean = sum1 / number
+    for level in range(first + 1):
+        sum2 += (level - mean) ** 2 * counts[level]
+    return first, second, mean, sum2 / number
+
+
+@compiled
 def _root(parent: IntArray, run: int) -> int:
     while parent[run] != run:
         parent[run] = parent[parent[run]]
@@ -161,33 +184,35 @@ def _root(parent: IntArray, run: int) -> int:
 
 
 @compiled
-def _components(bright: IntArray, height: int, width: int) -> tuple[IntArray, IntArray, BoolArray]:
-    """Runs (r, 4), areas and which are off the border, of flat indices (b,) of bright pixels in their order."""
-    runs = np.empty((len(bright), 4), dtype=np.int64)
-    parent = np.empty(len(bright), dtype=np.int64)
-    count, above, row_first, row = 0, 0, 0, -1
-    at = 0
-    while at < len(bright):
-        y, x = bright[at] // width, bright[at] % width
+def _components(bright: BoolArray, words: IntArray, height: int, width: int) -> tuple[IntArray, IntArray, BoolArray]:
+    """Runs (r, 4), areas and which are off the border, of pixels (p,) and the eights of them with a bright one."""
+    runs = np.empty((4 * len(words) + 4, 4), dtype=np.int64)
+    count, row, stop = 0, -1, 0
+    for index in range(len(words) + 1):
+        start = 8 * words[index] if index < len(words) else len(bright) // 8 * 8
+        for at in range(start, min(start + 8, len(bright))):
+            if bright[at]:
+                y, x = at // width, at % width
+                if y != row or x != stop:
+                    runs[count, 0], runs[count, 1] = y, x
+                    row = y
+                    count += 1
+                stop = x + 1
+                runs[count - 1, 2] = stop
+    # the runs of the row above are from one number to another
+    parent, above, first, row = np.empty(count, dtype=np.int64), 0, 0, -1
+    for run in range(count):
+        y, x, stop = runs[run, 0], runs[run, 1], runs[run, 2]
+        parent[run] = run
         if y != row:
-            # the runs of the row above, if it has any
-            above, row_first = (row_first if y == row + 1 else count), count
+            above, first = (first if y == row + 1 else run), run
             row = y
-        row_last = row_first
-        stop = x + 1
-        at += 1
-        while at < len(bright) and stop < width and bright[at] == y * width + stop:
-            stop += 1
-            at += 1
-        runs[count, 0], runs[count, 1], runs[count, 2] = y, x, stop
-        parent[count] = count
-        for other in range(above, row_last):
+        for other in range(above, first):
             if runs[other, 1] > stop:
                 break
             if runs[other, 2] >= x:
-                one, two = _root(parent, other), _root(parent, count)
+                one, two = _root(parent, other), _root(parent, run)
                 parent[max(one, two)] = min(one, two)
-        count += 1
     components = 0
     for run in range(count):
         root = _root(parent, run)
@@ -206,21 +231,35 @@ def _components(bright: IntArray, height: int, width: int) -> tuple[IntArray, In
 
 
 @compiled
-def _spread(runs: IntArray, owner: NDArray[np.uint16], wide: NDArray[np.uint16]) -> None:
-    """Write the components of the pixels with their margin, and with the ring around it; 0 is none."""
-    height, width = owner.shape
-    for run in range(len(runs)):
-        row, first, stop, component = runs[run, 0], runs[run, 1], runs[run, 2], runs[run, 3]
-        for y in range(max(row - MARGIN - _RING, 0), min(row + MARGIN + _RING + 1, height)):
-            for x in range(max(first - MARGIN - _RING, 0), min(stop + MARGIN + _RING, width)):
-                wide[y, x] = max(wide[y, x], component)
-        for y in range(max(row - MARGIN, 0), min(row + MARGIN + 1, height)):
-            for x in range(max(first - MARGIN, 0), min(stop + MARGIN, width)):
-                owner[y, x] = max(owner[y, x], component)
+def _spread(
+    runs: IntArray, first: int, last: int, box: IntArray, owner: NDArray[np.uint16], wide: NDArray[np.uint16]
+) -> None:
+    """Write the components of a box's pixels with their margin, and with the ring around it; 0 is none.
+
+    Args:
+        runs: of which those from the first until before the last are in rows near to the box.
+        first: index.
+        last: index.
+        box: (4,) see :func:`_boxes`.
+        owner: zeros of its size.
+        wide: zeros of its size.
+    """
+    top, bottom, left, right = box
+    for run in range(first, last):
+        row, start, stop, component = runs[run, 0], runs[run, 1], runs[run, 2], runs[run, 3]
+        if start - MARGIN - _RING >= right or stop + MARGIN + _RING <= left:
+            continue
+        for y in range(max(row - MARGIN - _RING, top), min(row + MARGIN + _RING + 1, bottom)):
+            for x in range(max(start - MARGIN - _RING, left), min(stop + MARGIN + _RING, right)):
+                wide[y - top, x - left] = max(wide[y - top, x - left], component)
+        for y in range(max(row - MARGIN, top), min(row + MARGIN + 1, bottom)):
+            for x in range(max(start - MARGIN, left), min(stop + MARGIN, right)):
+                owner[y - top, x - left] = max(owner[y - top, x - left], component)
     # the margin of one does not take the core of another
-    for run in range(len(runs)):
-        for x in range(runs[run, 1], runs[run, 2]):
-            owner[runs[run, 0], x] = runs[run, 3]
+    for run in range(first, last):
+        if top <= runs[run, 0] < bottom:
+            for x in range(max(runs[run, 1], left), min(runs[run, 2], right)):
+                owner[runs[run, 0] - top, x - left] = runs[run, 3]
 
 
 @compiled
@@ -245,8 +284,7 @@ def _boxes(runs: IntArray, kept: IntArray, count: int, height: int, width: int) 
 @compiled
 def _gather(
     image: NDArray[Any],
-    owner: NDArray[np.uint16],
-    wide: NDArray[np.uint16],
+    runs: IntArray,
     kept: IntArray,
     boxes: IntArray,
     background: tuple[float, float],
@@ -257,27 +295,37 @@ def _gather(
     ceilings: FloatArray,
 ) -> None:
     """Write the fields of :class:`Regions`."""
-    at = 0
+    starts = np.zeros(image.shape[0] + 1, dtype=np.int64)  # first run of each row
+    for run in range(len(runs)):
+        starts[runs[run, 0] + 1] += 1
+    for y in range(image.shape[0]):
+        starts[y + 1] += starts[y]
+    at, around = 0, MARGIN + _RING
     for k in range(len(kept)):
+        top, bottom, left, right = boxes[k]
+        owner = np.zeros((bottom - top, right - left), dtype=np.uint16)
+        wide = np.zeros((bottom - top, right - left), dtype=np.uint16)
+        near = starts[max(top - around, 0)], starts[min(bottom + around, image.shape[0])]
+        _spread(runs, near[0], near[1], boxes[k], owner, wide)
         ring, total = 0, 0.0
-        for y in range(boxes[k, 0], boxes[k, 1]):
-            for x in range(boxes[k, 2], boxes[k, 3]):
-                if owner[y, x] == 0 and wide[y, x] == kept[k]:
+        for y in range(top, bottom):
+            for x in range(left, right):
+                if owner[y - top, x - left] == 0 and wide[y - top, x - left] == kept[k]:
                     ring += 1
                     total += image[y, x]
         level, noise = background
         if ring >= _LEAST_RING:
             level = total / ring
             squares = 0.0
-            for y in range(boxes[k, 0], boxes[k, 1]):
-                for x in range(boxes[k, 2], boxes[k, 3]):
-                    if owner[y, x] == 0 and wide[y, x] == kept[k]:
+            for y in range(top, bottom):
+                for x in range(left, right):
+                    if owner[y - top, x - left] == 0 and wide[y - top, x - left] == kept[k]:
                         squares += (image[y, x] - level) ** 2
             noise = max(squares / (ring - 1), noise)
         ceilings[k] = saturation - level
-        for y in range(boxes[k, 0], boxes[k, 1]):
-            for x in range(boxes[k, 2], boxes[k, 3]):
-                if owner[y, x] == kept[k]:
+        for y in range(top, bottom):
+            for x in range(left, right):
+                if owner[y - top, x - left] == kept[k]:
                     above = image[y, x] - level
                     pixels[0, at], pixels[1, at], pixels[2, at] = x, y, above
                     shot = saturation / full_well * max(above, 0.0)
@@ -342,3 +390,19 @@ def _shapes(first: IntArray, pixels: FloatArray, ceilings: FloatArray, floor: fl
         found[k, 5] = cyy / total**2 + least
         found[k, 6] = math.sqrt(long / short)
         found[k, 7] = area / (4.0 * math.pi * math.sqrt(long * short))
+
+
+@compiled
+def groups_of(pixels: FloatArray, areas: FloatArray, apart: float) -> IntArray:
+    """(n,) the first region of the group of each: of regions whose edges are so near to each other, pixels."""
+    count = len(areas)
+    parent = np.arange(count)
+    for one in range(count):
+        for other in range(one):
+            reach = apart + math.sqrt(areas[one] / math.pi) + math.sqrt(areas[other] / math.pi)
+            if math.hypot(pixels[one, 0] - pixels[other, 0], pixels[one, 1] - pixels[other, 1]) < reach:
+                first, second = _root(parent, one), _root(parent, other)
+                parent[max(first, second)] = min(first, second)
+    for one in range(count):
+        parent[one] = _root(parent, one)
+    return parent

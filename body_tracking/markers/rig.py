@@ -87,3 +87,12 @@ class Rig:
             rotations[index] = so3.quat_to_matrix(so3.exp(pose[:3])) @ rotations[index]
             translations[index] += pose[3:]
         return Rig(tuple(cameras), rotations, translations, self.covariance)
+
+
+def parallel_cameras() -> Rig:
+    """A rig of two cameras with parallel axes, half a metre apart and known exactly, for trying loops out."""
+    matrix = np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
+    cameras = tuple(Camera(name, 640, 480, matrix, np.zeros(5)) for name in ("left", "right"))
+    size = 2 * (LENS + 5 + POSE)
+    translations = np.array([[0.0, 0.0, 0.0], [-0.5, 0.0, 0.0]])
+    return Rig(cameras, np.tile(np.eye(3), (2, 1, 1)), translations, np.zeros((size, size)))

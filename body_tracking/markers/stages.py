@@ -15,7 +15,7 @@ from body_tracking.core.joint_angles import JointAngles
 from body_tracking.core.parameters import Parameter, Value, fields_of, parameters_from
 from body_tracking.core.qos import LATCHED, RELIABLE, Qos
 from body_tracking.core.skeleton import NANOSECONDS
-from body_tracking.markers import angles, detection, setup, tracking, triangulation
+from body_tracking.markers import angles, corrections, detection, setup, tracking, triangulation
 from body_tracking.markers.angles import AngleEstimator, ChainAngles
 from body_tracking.markers.chain_files import load_chain
 from body_tracking.markers.codecs import Balls, CameraImage, Frames, PoseOfTarget, SpacePoints
@@ -36,6 +36,8 @@ from body_tracking.pipeline.stage import Now, Output, Port, Stage
 
 _SATURATED: Final = 0.05
 """Share of an image's pixels beyond which it is called saturated: 15 balls, 1 m away, fill less than 1 % of 640x480."""
+_ROWS: Final = 4
+"""Every so many rows are looked at for it."""
 _WATCH_NS: Final = NANOSECONDS // 4
 """Between two searches for a moved camera, of some frames each; a fault is to be named within a second."""
 _SEARCH_NS: Final = NANOSECONDS // 10
@@ -110,7 +112,8 @@ class DetectorStage(Stage):
             self._problems[topic] = text
             self._counters["images of another size"] += 1
             raise ImageError(text)
-        share = np.count_nonzero(pixels == np.iinfo(pixels.dtype).max) / pixels.size
+        some = pixels[::_ROWS]
+        share = np.count_nonzero(some == np.iinfo(pixels.dtype).max) / max(some.size, 1)
         if share > _SATURATED:
             self._problems[topic] = f"{topic}: {100 * share:.0f} % of the pixels are saturated"
             self._counters["saturated images"] += 1
@@ -316,7 +319,7 @@ class AnglesOfTargetsStage(Stage):
         targets = load_targets(setup.file_of(values["setup"], setup.TARGETS, "target"))
         self._shapes = {target.name: target for target in targets}
         self._angles = AngleEstimator(chain)
-        triangulation.prepare()  # its derivatives, by which errors of the calibration become those of angles
+        corrections.prepare()
         angles.prepare()
         self._sets: FrameSets[TargetPose] = FrameSets(
             chain.targets, 0, round(float(str(values["max_wait"])) * NANOSECONDS)
@@ -363,5 +366,5 @@ class AnglesOfTargetsStage(Stage):
 
 def prepare() -> None:
     """Compile the loops of all stages, or load them."""
-    for each in (detection, triangulation, tracking, angles):
+    for each in (detection, triangulation, tracking, corrections, angles):
         each.prepare()

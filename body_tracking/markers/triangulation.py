@@ -14,13 +14,12 @@ from typing import Final
 
 import numpy as np
 
-from body_tracking.core.camera import Camera
 from body_tracking.core.compiled import compiled
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
 from body_tracking.markers import hartley_sturm, projection
 from body_tracking.markers.observations import ImageBalls, Points
 from body_tracking.markers.rays import Rays, RigRays, TriangulationError, make_rays, rig_rays
-from body_tracking.markers.rig import Rig
+from body_tracking.markers.rig import Rig, parallel_cameras
 
 _STEPS: Final = 3
 """Gauss-Newton steps for three cameras or more: from where two rays meet, each leaves about a thousandth."""
@@ -115,14 +114,10 @@ def triangulate(rig: Rig, balls: Sequence[ImageBalls], settings: TriangulationSe
 
 def prepare() -> None:
     """Compile the loops, or load them, before the first images: a point before two parallel cameras."""
-    matrix = np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
-    cameras = tuple(Camera(name, 640, 480, matrix, np.zeros(5)) for name in ("left", "right"))
-    size = sum(projection.size(camera) for camera in cameras)
-    translations = np.array([[0.0, 0.0, 0.0], [-0.5, 0.0, 0.0]])
-    rig = Rig(cameras, np.tile(np.eye(3), (2, 1, 1)), translations, np.zeros((size, size)))
+    rig = parallel_cameras()
     balls = [
-        ImageBalls(0, name, np.array([[column, 240.0]]), np.ones(1), np.eye(2)[None])
-        for name, column in (("left", 420.0), ("right", 220.0))
+        ImageBalls(0, camera.frame_id, np.array([[column, 240.0]]), np.ones(1), np.eye(2)[None])
+        for camera, column in zip(rig.cameras, (420.0, 220.0), strict=True)
     ]
     triangulate(rig, balls)
 
