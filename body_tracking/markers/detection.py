@@ -164,7 +164,7 @@ def detect(
     regions = regions_of(image, components, kept, background, saturation, settings.full_well)
     shapes = shapes_of(regions, settings.floor)
     odd, cut = _odd(shapes, settings), ~components.inside[kept]
-    groups = groups_of(shapes.pixels, shapes.areas, _APART)
+    groups = groups_of(np.ascontiguousarray(shapes.pixels), np.ascontiguousarray(shapes.areas), _APART)
     members = np.bincount(groups, minlength=len(groups))
     # most regions are the image of one ball by itself
     plain = (members[groups] == 1) & ~odd & ~cut

@@ -220,7 +220,7 @@ def decide(
     unsure: set[str] = set()
     for names in _competing(candidates):
         some = {name: candidates[name][:_MOST] for name in names}
-        if np.prod([len(each) + 1 for each in some.values()]) > _MAX_COMBINATIONS:
+        if math.prod(len(each) + 1 for each in some.values()) > _MAX_COMBINATIONS:
             unsure.update(names)
             continue
         combinations = _combinations(some)

@@ -14,7 +14,6 @@ from typing import Final
 import numpy as np
 from scipy.special import gammainccinv
 
-from body_tracking.core import so3
 from body_tracking.core.compiled import compiled
 from body_tracking.core.compiled_so3 import turned
 from body_tracking.core.errors import BodyTrackingError
@@ -74,11 +73,37 @@ def umeyama(model: FloatArray, measured: FloatArray, weights: FloatArray) -> tup
     Returns:
         (b, 3, 3) and (b, 3), so that ``measured = rotation @ model + translation``.
     """
-    share = (weights / weights.sum(axis=1, keepdims=True))[:, None, :]
-    from_, to = share @ model, share @ measured
-    cross = (measured - to).swapaxes(1, 2) @ ((model - from_) * share.swapaxes(1, 2))
-    rotation = so3.nearest_rotation(cross)
-    return rotation, to[:, 0] - (rotation @ from_.swapaxes(1, 2))[:, :, 0]
+    rotations, translations = np.empty((len(model), 3, 3)), np.empty((len(model), 3))
+    model, measured, weights = map(np.ascontiguousarray, (model, measured, weights))
+    _fitted(model, measured, weights, rotations, translations)
+    return rotations, translations
+
+
+@compiled
+def _fitted(
+    model: FloatArray, measured: FloatArray, weights: FloatArray, rotations: FloatArray, translations: FloatArray
+) -> None:
+    """Write the results of :func:`umeyama`."""
+    for n in range(len(model)):
+        share = weights[n] / weights[n].sum()
+        from_, to, cross = np.zeros(3), np.zeros(3), np.zeros((3, 3))
+        for i in range(len(share)):
+            for a in range(3):
+                from_[a] += share[i] * model[n, i, a]
+                to[a] += share[i] * measured[n, i, a]
+        for i in range(len(share)):
+            for a in range(3):
+                for b in range(3):
+                    cross[a, b] += share[i] * (measured[n, i, a] - to[a]) * (model[n, i, b] - from_[b])
+        left, _, right = np.linalg.svd(cross)
+        # no reflection: the direction that is known worst is turned over
+        if np.linalg.det(left) * np.linalg.det(right) < 0.0:
+            left[:, 2] *= -1.0
+        for a in range(3):
+            translations[n, a] = to[a]
+            for b in range(3):
+                rotations[n, a, b] = left[a, 0] * right[0, b] + left[a, 1] * right[1, b] + left[a, 2] * right[2, b]
+                translations[n, a] -= rotations[n, a, b] * from_[b]
 
 
 def maximum_likelihood(

@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
+from body_tracking.core.compiled import compiled
+from body_tracking.core.compiled_linear import whitening_of
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import BoolArray, FloatArray
 from body_tracking.markers.observations import TargetPose
+
+_ROUNDING: Final = 1e-6
+_PROBLEMS: Final = (
+    "numbers that are not finite",
+    "a matrix that is no rotation",
+    "a covariance that is not positive definite",
+)
 
 
 class PoseTableError(BodyTrackingError):
@@ -90,8 +101,9 @@ def pose_table(frames: Sequence[Sequence[TargetPose]], targets: Sequence[str]) -
     n, m = len(frames), len(targets)
     if n < 1:
         raise PoseTableError("poses: no frame")
-    rotations, translations = np.tile(np.eye(3), (n, m, 1, 1)), np.zeros((n, m, 3))
-    covariance = np.tile(np.eye(6), (n, m, 1, 1))
+    rotations, translations = np.zeros((n, m, 3, 3)), np.zeros((n, m, 3))
+    covariance, whitening = np.zeros((n, m, 6, 6)), np.zeros((n, m, 6, 6))
+    rotations[..., range(3), range(3)] = covariance[..., range(6), range(6)] = 1.0
     seen, residual, balls = np.zeros((n, m), dtype=bool), np.full((n, m), np.nan), np.zeros((n, m))
     column = {target: index for index, target in enumerate(targets)}
     for row, frame in enumerate(frames):
@@ -115,13 +127,10 @@ def pose_table(frames: Sequence[Sequence[TargetPose]], targets: Sequence[str]) -
             covariance[row, index] = pose.covariance
             seen[row, index], residual[row, index] = True, pose.residual
             balls[row, index] = np.count_nonzero(pose.points >= 0)
-    _check(rotations, translations, covariance, targets)
-    try:
-        whitening = np.linalg.inv(np.linalg.cholesky(covariance)) * seen[..., None, None]
-    except np.linalg.LinAlgError as error:
-        raise PoseTableError(
-            f"{_first_bad(covariance, targets)}: a covariance that is not positive definite"
-        ) from error
+    bad = _whiten(rotations, translations, covariance, seen, whitening)
+    if bad >= 0:
+        row, index, problem = bad // 3 // m, bad // 3 % m, _PROBLEMS[bad % 3]
+        raise PoseTableError(f"frame {row}, target {targets[index]}: {problem}")
     return PoseTable(
         tuple(targets),
         rotations,
@@ -134,20 +143,38 @@ def pose_table(frames: Sequence[Sequence[TargetPose]], targets: Sequence[str]) -
     )
 
 
-def _check(rotations: FloatArray, translations: FloatArray, covariance: FloatArray, targets: Sequence[str]) -> None:
-    n, m = rotations.shape[:2]
-    numbers = np.concatenate([rotations.reshape(n, m, 9), translations, covariance.reshape(n, m, 36)], axis=-1)
-    if not np.isfinite(numbers).all():
-        row, index = np.argwhere(~np.isfinite(numbers).all(axis=-1))[0]
-        raise PoseTableError(f"frame {row}, target {targets[index]}: numbers that are not finite")
-    product = rotations @ rotations.swapaxes(-1, -2) - np.eye(3)
-    proper = (np.abs(product).reshape(n, m, 9).max(axis=-1) < 1e-6) & (np.linalg.det(rotations) > 0.0)
-    if not proper.all():
-        row, index = np.argwhere(~proper)[0]
-        raise PoseTableError(f"frame {row}, target {targets[index]}: a matrix that is no rotation")
-
-
-def _first_bad(covariance: FloatArray, targets: Sequence[str]) -> str:
-    least = np.linalg.eigvalsh(covariance)[..., 0]
-    row, index = np.unravel_index(int(least.argmin()), least.shape)
-    return f"frame {row}, target {targets[int(index)]}"
+@compiled
+def _whiten(
+    rotations: FloatArray, translations: FloatArray, covariance: FloatArray, seen: BoolArray, whitening: FloatArray
+) -> int:
+    """Write the whitening of what is seen into zeros; -1, or of the first pose that is invalid three times its number
+    and which of the problems it is.
+    """
+    n, m = seen.shape
+    for at in range(n * m):
+        row, index = at // m, at % m
+        if not seen[row, index]:
+            continue
+        turn, finite = rotations[row, index], True
+        for i in range(3):
+            finite &= math.isfinite(translations[row, index, i])
+            for j in range(3):
+                finite &= math.isfinite(turn[i, j])
+        for i in range(6):
+            for j in range(6):
+                finite &= math.isfinite(covariance[row, index, i, j])
+        if not finite:
+            return 3 * at
+        for i in range(3):
+            for j in range(i + 1):
+                product = turn[i, 0] * turn[j, 0] + turn[i, 1] * turn[j, 1] + turn[i, 2] * turn[j, 2]
+                if not abs(product - (i == j)) < _ROUNDING:
+                    return 3 * at + 1
+        determinant = turn[0, 0] * (turn[1, 1] * turn[2, 2] - turn[1, 2] * turn[2, 1])
+        determinant += turn[0, 1] * (turn[1, 2] * turn[2, 0] - turn[1, 0] * turn[2, 2])
+        determinant += turn[0, 2] * (turn[1, 0] * turn[2, 1] - turn[1, 1] * turn[2, 0])
+        if determinant < 0.0:
+            return 3 * at + 1
+        if not whitening_of(covariance[row, index], whitening[row, index]):
+            return 3 * at + 2
+    return -1

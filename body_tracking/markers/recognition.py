@@ -12,7 +12,10 @@ from typing import Final
 
 import numpy as np
 
+from body_tracking.core.compiled import compiled
+from body_tracking.core.compiled_linear import whitening_of
 from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.skeleton import FloatArray
 from body_tracking.markers.interpretation import MAX_CHANCE, Candidate, decide, expected_by_chance, fitted
 from body_tracking.markers.observations import Points, TargetPose
 from body_tracking.markers.search import Deadline, DeadlineError, Pairs, Shape, near_pairs
@@ -159,8 +162,17 @@ def check_points(points: Points) -> None:
         )
     if not (np.isfinite(points.positions).all() and np.isfinite(points.covariance).all()):
         raise RecognitionError(f"points at {points.stamp_ns} ns: a number is not finite")
-    if count and np.linalg.eigvalsh(points.covariance)[:, 0].min() <= 0.0:
+    if not _definite(np.ascontiguousarray(points.covariance)):
         raise RecognitionError(f"points at {points.stamp_ns} ns: a covariance is not positive definite")
+
+
+@compiled
+def _definite(matrices: FloatArray) -> bool:
+    """Whether all of (n, 3, 3) are positive definite."""
+    scratch, definite = np.empty((3, 3)), True
+    for n in range(len(matrices)):
+        definite &= whitening_of(matrices[n], scratch)
+    return definite
 
 
 def target_pose(name: str, points: Points, candidate: Candidate) -> TargetPose:
