@@ -1,4 +1,4 @@
-"""``body_tracking compile``: compiles the loops over pixels and candidates, which else happens at the first image."""
+"""``body_tracking compile``: compiles the loops of image processing and of the extended filter in advance."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from body_tracking.systems import SYSTEMS
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the subcommand ``compile``."""
     text = (
-        "Compiles the loops of the image processing, and keeps the machine code beside the package or in the user's "
-        "cache folder. Otherwise the first node that needs them takes half a minute to start."
+        "Compiles the loops of the image processing and of the filter ekf, and keeps the machine code beside the "
+        "package or in the user's cache folder. Otherwise the first node that needs them takes half a minute to start."
     )
     subparsers.add_parser("compile", help=text, description=text).set_defaults(run=run)
 

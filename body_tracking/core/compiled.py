@@ -1,4 +1,4 @@
-"""Loops over pixels and candidates, compiled by numba the first time they run.
+"""Loops, compiled by numba the first time they run.
 
 Importing numba takes half a second: only modules that run such loops import this one.
 """

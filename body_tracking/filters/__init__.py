@@ -97,6 +97,12 @@ def _row(name: str) -> tuple[str, str, str]:
     return _FILTERS[name]
 
 
+def prepare(name: str) -> None:
+    """Compile the loops of a filter, or load what is kept of them, which else happens at its first frames."""
+    if _row(name)[2] == "ekf.":
+        _load("ekf.filter:prepare")()
+
+
 def parameter_prefix(name: str) -> str:
     """The prefix of a filter's parameters; see :func:`parameter_classes`.
 

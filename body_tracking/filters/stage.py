@@ -15,6 +15,7 @@ from body_tracking.filters import (
     FILTERS,
     parameter_classes,
     parameter_prefix,
+    prepare,
 )
 from body_tracking.filters.people import PeopleFilter, filter_of
 from body_tracking.filters.person import DEFAULT_ORDER_WAIT, DEFAULT_PREDICT_AFTER, FilterSettings, PersonFilter
@@ -203,6 +204,7 @@ class FilterStage(Stage):
         return ()
 
     def _prepare(self) -> None:
+        prepare(str(self.values["filter"]))
         if self.filter.by_sensor:
             association.prepare()
 

@@ -138,4 +138,5 @@ SYSTEM = System(
             "are the angles of the convention `model`",
         ),
     ),
+    prepare="body_tracking.filters.ekf.filter:prepare",
 )

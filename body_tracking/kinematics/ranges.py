@@ -88,6 +88,7 @@ class Ranges:
         low, high: (26,) radians, of :class:`SoftCoordinates`.
         centre, stddev: (26,) radians: prior of each coordinate by its range.
         coordinates: their slice of the tangent vector.
+        to_centre: (2, 4) quaternions from the centres of the reach of the left and the right shoulder.
         twist: (26,) coefficients of the difference from sharing a twist between lumbar and thoracic joints by range.
     """
 
@@ -127,11 +128,11 @@ class Ranges:
             for side in _REACH
         }
         hanging = np.array([0.0, 0.0, -1.0])
-        self._to_centre: FloatArray = so3.quat_inverse(
+        self.to_centre: FloatArray = so3.quat_inverse(
             so3.exp(np.array([0.5 * np.pi * np.cross(hanging, reach) for reach in _REACH.values()]))
         )
 
-        self._centre = so3.quat_inverse(self._to_centre)
+        self._centre = so3.quat_inverse(self.to_centre)
         self._scalar_middle = self.centre[self._scalar_soft]
         self._scalar_reach = 0.5 * (self.high - self.low)[self._scalar_soft]
 
@@ -154,7 +155,7 @@ class Ranges:
         """Those of :class:`SoftCoordinates` alone."""
         values = np.empty((*q.shape[:-1], len(self.low)))
         values[..., self._scalar_soft] = q[..., self._model.scalar_q]
-        values[..., self._soft] = so3.log(so3.quat_multiply(self._to_centre, q[..., self._quaternions]))
+        values[..., self._soft] = so3.log(so3.quat_multiply(self.to_centre, q[..., self._quaternions]))
         return values
 
     def excess(self, q: FloatArray) -> FloatArray:
@@ -194,7 +195,7 @@ class Ranges:
         turned[:, :2] *= np.minimum(1.0, (np.radians(SHOULDER_SWING) + margin) / np.maximum(swing, 1e-12))
         twist = np.radians(SHOULDER_TWIST) + margin
         turned[:, 2] = np.clip(turned[:, 2], -twist, twist)
-        clipped[self._quaternions] = so3.quat_multiply(so3.quat_inverse(self._to_centre), so3.exp(turned))
+        clipped[self._quaternions] = so3.quat_multiply(so3.quat_inverse(self.to_centre), so3.exp(turned))
         clipped[self._model.scalar_q] = np.clip(
             q[self._model.scalar_q], self.low[rows] - margin, self.high[rows] + margin
         )

@@ -43,7 +43,7 @@ PARENTS: Final = (-1, 0, 1, 2, 2, 2, 4, 5, 6, 7, 8, 9)
 """Index of each segment's parent; -1 for the base."""
 
 # segment: the axes of the joint that connects it to its parent, one after the other; None for a ball joint
-_AXES: tuple[tuple[tuple[str, FloatArray], ...] | None, ...] = (
+AXES: tuple[tuple[tuple[str, FloatArray], ...] | None, ...] = (
     None,
     (("lumbar_flexion", _Y), ("lumbar_lateral", _X), ("lumbar_axial", _Z)),
     (("thoracic_flexion", _Y), ("thoracic_lateral", _X), ("thoracic_axial", _Z)),
@@ -97,7 +97,7 @@ _LENGTHS: dict[str, float] = {
 LENGTHS: tuple[str, ...] = tuple(_LENGTHS)
 
 # point: segment that carries it, and its place there as a sum of lengths along directions
-_POINTS: tuple[tuple[Joint, str, tuple[tuple[str, FloatArray], ...]], ...] = (
+POINTS: tuple[tuple[Joint, str, tuple[tuple[str, FloatArray], ...]], ...] = (
     (Joint.SPINE_BASE, "pelvis", ()),
     (Joint.HIP_LEFT, "pelvis", (("hip_width_left", _Y), ("hip_drop", -_Z))),
     (Joint.HIP_RIGHT, "pelvis", (("hip_width_right", -_Y), ("hip_drop", -_Z))),
@@ -120,7 +120,7 @@ _POINTS: tuple[tuple[Joint, str, tuple[tuple[str, FloatArray], ...]], ...] = (
 )
 
 # where each segment's frame stands: at a point of its parent
-_ORIGINS: tuple[Joint, ...] = (
+ORIGINS: tuple[Joint, ...] = (
     Joint.SPINE_BASE,
     Joint.SPINE_BASE,
     Joint.SPINE_MID,
@@ -171,7 +171,7 @@ class UpperBody:
         axes = np.zeros((len(SEGMENTS), 3, 3))
         scalar_of: list[tuple[int, int]] = []
         nq = 7
-        for segment, joint in enumerate(_AXES):
+        for segment, joint in enumerate(AXES):
             if segment == 0:
                 continue
             start = len(names)
@@ -194,7 +194,7 @@ class UpperBody:
             self.segment_coordinates.append(slice(start, len(names)))
         self.coordinate_names: tuple[str, ...] = tuple(names)
         self.nq, self.nv = nq, len(names)
-        self.joints: IntArray = np.array([point[0] for point in _POINTS], dtype=np.intp)
+        self.joints: IntArray = np.array([point[0] for point in POINTS], dtype=np.intp)
 
         self._quaternion_of = {
             SEGMENTS[s]: slice(start, start + 4) for s, start in zip(ball_segments, q_ball, strict=True)
@@ -231,10 +231,10 @@ class UpperBody:
             (_rotations(level[0], level[-1] + 1), _rotations(PARENTS[level[0]], PARENTS[level[-1]] + 1))
             for level in levels
         ]
-        point_of = {joint: number for number, (joint, _, _) in enumerate(_POINTS)}
-        segment_of = [SEGMENTS.index(name) for _, name, _ in _POINTS]
+        point_of = {joint: number for number, (joint, _, _) in enumerate(POINTS)}
+        segment_of = [SEGMENTS.index(name) for _, name, _ in POINTS]
         self.point_segments: IntArray = np.array(segment_of, dtype=np.intp)
-        self._origin_point: IntArray = np.array([point_of[joint] for joint in _ORIGINS], dtype=np.intp)
+        self._origin_point: IntArray = np.array([point_of[joint] for joint in ORIGINS], dtype=np.intp)
         self._place_directions(scalar_segments, ball_segments)
         self._place_lengths(segment_of)
 
@@ -245,7 +245,7 @@ class UpperBody:
                 turns[segment] = turns[parent]
             turns[segment, self.segment_coordinates[segment]] = 1.0
         self._turns = turns[:, None, 3:]
-        self._minus_moves = np.full((len(_POINTS), 1, self.nv), -1.0)  # the base's translation moves every point
+        self._minus_moves = np.full((len(POINTS), 1, self.nv), -1.0)  # the base's translation moves every point
         self._minus_moves[..., 3:] = -self._turns[segment_of]
         carrier = [
             segment for segment, part in enumerate(self.segment_coordinates) for _ in range(part.start, part.stop)
@@ -264,7 +264,7 @@ class UpperBody:
         The last axis of a joint stands still in the segment that it turns, the first one in the parent. The middle one
         of three stands still in a frame of its own, which comes after the segments.
         """
-        three = [s for s in scalar_segments if len(_AXES[s] or ()) == 3]
+        three = [s for s in scalar_segments if len(AXES[s] or ()) == 3]
         assert three == scalar_segments[: self._three_axes]
         # the last level: the middle axes of the joints with three
         first = PARENTS[three[0]]
@@ -276,7 +276,7 @@ class UpperBody:
             start = self.segment_coordinates[segment].start
             frame.update({start + axis: (segment, np.eye(3)[axis]) for axis in range(3)})
         for segment in scalar_segments:
-            joint = _AXES[segment]
+            joint = AXES[segment]
             assert joint is not None
             start = self.segment_coordinates[segment].start
             frame[start] = (PARENTS[segment], joint[0][1])
@@ -288,8 +288,8 @@ class UpperBody:
     def _place_lengths(self, segment_of: list[int]) -> None:
         """Along which column of which segment each length extends, and in the places of which points it counts."""
         carried: dict[str, tuple[int, FloatArray]] = {}
-        self._counts = np.zeros((len(_POINTS), len(LENGTHS)))
-        for point, (_, _, parts) in enumerate(_POINTS):
+        self._counts = np.zeros((len(POINTS), len(LENGTHS)))
+        for point, (_, _, parts) in enumerate(POINTS):
             for name, direction in parts:
                 known, along = carried.setdefault(name, (segment_of[point], direction))
                 assert known == segment_of[point] and np.array_equal(along, direction)

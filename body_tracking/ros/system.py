@@ -32,6 +32,6 @@ SYSTEM = System(
             "body_tracking.ros.doctor",
             "find out why nothing arrives: check the shell, the graph or a bag",
         ),
-        Command("compile", "body_tracking.compilation", "compile the image processing in advance"),
+        Command("compile", "body_tracking.compilation", "compile image processing and the filter ekf in advance"),
     ),
 )

@@ -17,10 +17,11 @@ from scipy.stats import binom
 
 from body_tracking.core import so3
 from body_tracking.core.body_model import SEGMENTS
+from body_tracking.core.compiled import LOOPS
 from body_tracking.core.orientation import SEGMENT_NUMBER, SegmentOrientation
-from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton
+from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton
 from body_tracking.filters.ekf import sources as orientation
-from body_tracking.filters.ekf.filter import ExtendedKalmanFilter
+from body_tracking.filters.ekf.filter import ExtendedKalmanFilter, prepare
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.sources import PER_SOURCE, Sources
 from body_tracking.kinematics.ranges import Ranges
@@ -181,6 +182,26 @@ def learnt(estimator: ExtendedKalmanFilter, source: Source) -> tuple[FloatArray,
     begin = BODY + PER_SOURCE * number
     covariance = state.covariance[begin : begin + 4, begin : begin + 4]
     return np.append(off, source.heading - state.sources.heading[number]), covariance
+
+
+# --- compilation
+
+
+def test_no_frame_or_orientation_waits_for_the_compiler() -> None:
+    prepare()
+    before = sum(len(loop.signatures) for loop in LOOPS)
+    person = worn_person(1, 4.0)
+    hidden = [
+        replace(each, states=np.where(np.arange(N_JOINTS) < 8, 0, each.states).astype(np.uint8))
+        for each in person.skeletons[50:55]
+    ]
+    estimator = ExtendedKalmanFilter(EkfParameters(forget_after=0.5))
+    sources = [Source(segment).measure(person) for segment in ("forearm_left", "hand_right", "upper_arm_left")]
+    sources[1] = sources[1][:40]  # it is forgotten
+    feed(estimator, in_order(person.skeletons[:50], hidden, person.skeletons[55:], *sources))
+    estimator.predict(known(estimator).stamp_ns + NANOSECONDS // 10)
+    estimator.results_of(estimator.last_frame())
+    assert before and sum(len(loop.signatures) for loop in LOOPS) == before
 
 
 # --- equations

@@ -8,6 +8,7 @@ import pytest
 from body_tracking.core import so3
 from body_tracking.core.body_model import SEGMENTS, ModelError
 from body_tracking.core.skeleton import FloatArray, Joint
+from body_tracking.kinematics.compiled_body import CompiledUpperBody
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UNOBSERVED, UpperBody
 
@@ -240,3 +241,21 @@ def test_configurations_of_wrong_shape_raise(nq: int, nl: int) -> None:
         MODEL.forward(np.zeros(nq), np.zeros(nl))
     with pytest.raises(ModelError, match=r"upper_body: .* expected"):
         MODEL.linearise(np.zeros(nq), np.zeros(nl))
+
+
+def test_compiled_kinematics_of_one_configuration_are_those_of_many() -> None:
+    compiled, lengths = CompiledUpperBody(), _lengths(20)
+    tangents = np.random.default_rng(8).normal(size=(20, MODEL.nv))
+    for q, own, v in zip(_poses(20), lengths, tangents, strict=True):
+        np.testing.assert_allclose(compiled.integrate(q, v), MODEL.integrate(q, v), rtol=0, atol=1e-14)
+        one, many = compiled.linearise(q, own), MODEL.linearise(q, own)
+        for posture in (one.posture, compiled.forward(q, own)):
+            for name in ("positions", "origins", "rotations"):
+                np.testing.assert_allclose(getattr(posture, name), getattr(many.posture, name), rtol=0, atol=1e-14)
+        for name in ("jacobian", "length_jacobian", "rotation_jacobian"):
+            np.testing.assert_allclose(getattr(one, name), getattr(many, name), rtol=0, atol=1e-14)
+        spread = np.cov(tangents.T)
+        np.testing.assert_allclose(compiled.curvature(one, spread), MODEL.curvature(many, spread), rtol=0, atol=1e-13)
+    for segment in range(len(SEGMENTS)):
+        for own, other in zip(compiled.turning(q, segment), MODEL.turning(q, segment), strict=True):
+            np.testing.assert_allclose(own, other, rtol=0, atol=1e-14)

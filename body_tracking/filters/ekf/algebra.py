@@ -37,19 +37,3 @@ def whitening_of(covariance: FloatArray) -> FloatArray:
     inverse: FloatArray
     inverse, _ = dtrtri(cholesky(covariance), lower=1, overwrite_c=1)  # above the diagonal it stays 0
     return inverse
-
-
-def squared_distance(covariances: FloatArray, vectors: FloatArray) -> FloatArray:
-    """(n,) squared Mahalanobis distances of (n, 3) by (n, 3, 3); LAPACK takes three times as long for so small ones."""
-    x, y, z = vectors.T
-    xx, xy, xz, _, yy, yz, _, _, zz = covariances.reshape(-1, 9).T
-    # C = L D L^T, and L w = v
-    l10, l20 = xy / xx, xz / xx
-    d1 = yy - l10 * xy
-    rest = yz - l20 * xy
-    l21 = rest / d1
-    d2 = zz - l20 * xz - l21 * rest
-    y = y - l10 * x
-    z = z - l20 * x - l21 * y
-    result: FloatArray = x * x / xx + y * y / d1 + z * z / d2
-    return result

@@ -6,12 +6,13 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from body_tracking.calibration.joint_centres import JointCentres
-from body_tracking.core.body_model import Linearisation
 from body_tracking.core.measurement import joint_correlation
 from body_tracking.core.skeleton import N_JOINTS, FloatArray, Joint
+from body_tracking.filters.ekf.kernels import displaced
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.sources import PER_SOURCE
 from body_tracking.filters.ekf.state import State, StateSpace
+from body_tracking.kinematics.compiled_body import Linearised
 
 _DIMENSIONS = 3
 _BENT, _ARM_OFFSETS = ("SHOULDER", "ELBOW", "WRIST"), 2.0
@@ -39,7 +40,7 @@ class Displacement:
         self._rows = (_DIMENSIONS * space.model.joints[:, None] + np.arange(_DIMENSIONS)).reshape(-1)
         joints = space.model.joints
         correlation = joint_correlation()[np.ix_(joints, joints)]
-        self._root = np.kron(np.linalg.cholesky(correlation), np.eye(_DIMENSIONS))
+        self._correlation = np.kron(correlation, np.eye(_DIMENSIONS))
         self.prior_information = block_diag(np.diag(space.rest_information), np.linalg.inv(space.lengths_covariance))
 
     def displaced(self, state: State) -> FloatArray:
@@ -50,13 +51,13 @@ class Displacement:
         without any measurement: ``G B G^T``. To first order: forearms and hands, which are hardly longer than the
         offsets, err by more.
         """
-        lines = self._space.model.linearise(state.q, state.lengths)
+        lines = self._space.model.linearised(state.q, state.lengths)
         information = self.prior_information
         if state.sources.names:
             information = information + self._held(state, lines)
         return self.covariance(state, lines, information)
 
-    def covariance(self, state: State, lines: Linearisation, information: FloatArray) -> FloatArray:
+    def covariance(self, state: State, lines: Linearised, information: FloatArray) -> FloatArray:
         """The same, where (53, 53) information is what is known without any point."""
         space = self._space
         weights = sum(
@@ -67,23 +68,22 @@ class Displacement:
         if state.sources.names:
             weights = np.where(space.thumbs[state.sources.segments].any(axis=0), 0.0, weights)
             offsets = np.where(self._of_arms, _ARM_OFFSETS * offsets, offsets)
-        observation = space.observation(lines)
-        weighted = observation.T * weights.repeat(_DIMENSIONS)
-        gain = np.linalg.solve(weighted @ observation + information, weighted)
+        observation = lines.observation
         if self._centres.offsets is not None:
-            known: FloatArray = self._parameters.offset_scale**2 * gain @ self._left(state, lines) @ gain.T
-            return known
-        displacement: FloatArray = gain * offsets.repeat(_DIMENSIONS) @ self._root
-        return displacement @ displacement.T
+            spread = self._parameters.offset_scale**2 * self._left(state, lines)
+        else:
+            deviations = offsets.repeat(_DIMENSIONS)
+            spread = self._correlation * deviations * deviations[:, None]
+        return displaced(observation, weights, information, spread)
 
-    def _left(self, state: State, lines: Linearisation) -> FloatArray:
+    def _left(self, state: State, lines: Linearised) -> FloatArray:
         """(57, 57) covariance of the points' offsets after a T-pose."""
         positions = np.full((N_JOINTS, _DIMENSIONS), np.nan)
         positions[self._space.model.joints] = lines.posture.positions
         spread: FloatArray = self._centres.spread(positions, state.stamp_ns)[np.ix_(self._rows, self._rows)]
         return spread
 
-    def _held(self, state: State, lines: Linearisation) -> FloatArray:
+    def _held(self, state: State, lines: Linearised) -> FloatArray:
         """(53, 53) information on tangent and lengths by orientations, whatever cameras say."""
         space = self._space
         own = state.covariance.diagonal()[space.size :].reshape(-1, PER_SOURCE)

@@ -27,8 +27,8 @@ from body_tracking.filters.ekf.skeletons import SkeletonUpdate
 from body_tracking.filters.ekf.smoothing import Frame, Link, Smoother
 from body_tracking.filters.ekf.sources import pose_of
 from body_tracking.filters.ekf.state import Measurement, SensorState, State, StateSpace
+from body_tracking.kinematics.compiled_body import CompiledUpperBody
 from body_tracking.kinematics.lengths import SegmentLengths
-from body_tracking.kinematics.upper_body import UpperBody
 
 _TRACKED = np.uint8(TrackingState.TRACKED)
 _EYE3 = np.eye(3)
@@ -36,6 +36,8 @@ _START_FRAMES = 4
 """Frames of one sensor for an estimate of its noise."""
 _WAIT_NS = NANOSECONDS // 2
 """Frames farther apart than this do not make a start together."""
+_PREPARED = 10
+"""Frames after which all compiled functions have run."""
 _MAX_COORDINATE = 100.0
 _LONGEST_WAIT_NS = NANOSECONDS // 10
 """Greatest time that an orientation is queued without a request for the estimate."""
@@ -55,9 +57,9 @@ class ExtendedKalmanFilter:
         counters: what happened since the construction, for diagnostics.
     """
 
-    def __init__(self, parameters: EkfParameters | None = None, model: UpperBody | None = None) -> None:
+    def __init__(self, parameters: EkfParameters | None = None, model: CompiledUpperBody | None = None) -> None:
         self.parameters = p = parameters or EkfParameters()
-        self.model = model or UpperBody()
+        self.model = model or CompiledUpperBody()
         self.counters: dict[str, int] = dict.fromkeys(
             (
                 "frames",
@@ -553,3 +555,17 @@ class ExtendedKalmanFilter:
 def _order(measurement: Measurement | SegmentOrientation) -> tuple[int, str]:
     """Where it belongs among others: by its time; of the same time, frames come before orientations."""
     return measurement.stamp_ns, measurement.source if isinstance(measurement, SegmentOrientation) else ""
+
+
+def prepare() -> None:
+    """Compile all that a frame needs, or load what is kept of that: some frames of a person who stands still."""
+    estimator = ExtendedKalmanFilter()
+    positions = np.full((N_JOINTS, 3), np.nan)
+    model = estimator.model
+    positions[model.joints] = model.forward(model.neutral(), model.default_lengths()).positions
+    states = np.full(N_JOINTS, _TRACKED)
+    covariances = np.full((N_JOINTS, 3, 3), 1e-4 * _EYE3)
+    for number in range(_PREPARED):
+        stamp_ns = number * NANOSECONDS // 30
+        estimator.take(Skeleton(stamp_ns, "", positions, states, covariances=covariances))
+    assert estimator.filtered is not None

@@ -7,7 +7,8 @@ import math
 import numpy as np
 
 from body_tracking.core import so3
-from body_tracking.core.skeleton import NANOSECONDS, FloatArray, IntArray, SingleArray
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, IntArray
+from body_tracking.filters.ekf.kernels import carry, transported
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.sources import PER_SOURCE, advance
 from body_tracking.filters.ekf.state import State, StateSpace
@@ -38,7 +39,7 @@ class Motion:
 
     def __init__(self, space: StateSpace, parameters: EkfParameters) -> None:
         self._space, self._model, self._parameters = space, space.model, parameters
-        self._ball_rows = space.model.ball_v.reshape(-1)
+        self._balls = np.ascontiguousarray(space.model.ball_v[:, 0])
         self._group, self.first_log_density = self._groups()
         self._log_density_bounds = self.first_log_density - _DENSITY_DOWN, self.first_log_density + _DENSITY_UP
         self._group_sum = np.zeros((len(self.first_log_density), space.nv))
@@ -47,10 +48,6 @@ class Motion:
         self._swift = np.zeros((len(self._quick), space.nv), dtype=np.bool_)
         for segment, turning in enumerate(self._quick):
             self._swift[segment, turning[turning >= 6]] = True
-        # of the flat covariance the diagonals of its blocks: tangent, velocities, and between these
-        t, v = space.tangent.start, space.velocities.start
-        self._diagonal_blocks = np.array([(t, t), (v, v), (t, v), (v, t)])
-        self._diagonals: dict[int, IntArray] = {}  # by the size of the covariance
 
     def predicted(self, state: State, stamp_ns: int) -> State:
         """The motion model over the time that passed (integrated Ornstein-Uhlenbeck velocity)."""
@@ -67,22 +64,25 @@ class Motion:
         step = reach * state.velocity
         q = self._model.integrate(state.q, step)
 
-        turns = self._turns(step)
-        p = state.covariance.copy()
-        crosses = math.exp(-dt / self._slow_time(state)) * state.crosses
-        for part in (p, p.T, crosses):  # F P, then (F P) F^T, as rows and columns; and F C
-            self._carried(part, turns, reach, fade)
+        # covariance of the integrals of white noise over dt
+        vv = 0.5 * tau * (1.0 - fade * fade)
+        tv = 0.5 * reach * reach
+        tt = tau * tau * (dt - 2.0 * reach + vv)
+        p, crosses = transported(
+            state.covariance,
+            state.crosses,
+            self._turns(step),
+            self._balls,
+            reach,
+            fade,
+            math.exp(-dt / self._slow_time(state)),
+            np.array([[tt], [vv], [tv]]) * density,
+        )
         sources = state.sources
         if sources.names:
             share = advance(p, space.size, sources, dt, self._parameters)
             crosses.reshape(len(p), -1)[space.size :].reshape(len(sources), PER_SOURCE, -1)[:, 4:] *= share
             sources = sources.faded(share)
-        # covariance of the integrals of white noise over dt
-        vv = 0.5 * tau * (1.0 - fade * fade)
-        tv = 0.5 * reach * reach
-        tt = tau * tau * (dt - 2.0 * reach + vv)
-        p.reshape(-1)[self._diagonals_of(len(p))] += np.array([[tt], [vv], [tv], [tv]]) * density
-
         fading = math.exp(-dt / _WHITENESS_TIME)
         return state.but(
             stamp_ns=stamp_ns,
@@ -103,7 +103,7 @@ class Motion:
         """Multiply rows (85, n) by the transition of :meth:`predicted` from the left, in place."""
         dt = (stamp_ns - state.stamp_ns) / NANOSECONDS
         fade, reach = self._faded(dt)
-        self._carried(part, self._turns(reach * state.velocity), reach, fade)
+        carry(part, self._turns(reach * state.velocity), self._balls, reach, fade)
 
     def _faded(self, dt: float) -> tuple[float, float]:
         """Share of a velocity after a time, and by how many seconds of it the position moves."""
@@ -114,27 +114,10 @@ class Motion:
         """(3, 3, 3) rotations of the free rotations' tangents by a step (32,)."""
         return so3.quat_to_matrix(so3.exp(-step[self._model.ball_v]))
 
-    def _carried(self, part: FloatArray | SingleArray, turns: FloatArray, reach: float, fade: float) -> None:
-        space = self._space
-        self._turned_back(part, turns)
-        part[space.tangent] += reach * part[space.velocities]
-        part[space.velocities] *= fade
-
     def _slow_time(self, state: State) -> float:
         """Seconds for which slow errors of cameras persist."""
         p = self._parameters
         return p.slow_time_beside_orientations if state.sources.names else p.slow_time
-
-    def _diagonals_of(self, size: int) -> IntArray:
-        """(4, 32) where a flat covariance of this size has the diagonals of its blocks."""
-        if size not in self._diagonals:
-            starts = self._diagonal_blocks @ [size, 1]
-            self._diagonals[size] = starts[:, None] + (size + 1) * np.arange(self._space.nv)
-        return self._diagonals[size]
-
-    def _turned_back(self, errors: FloatArray | SingleArray, turns: FloatArray) -> None:
-        """Turn the rows (85, n) of the base's and the shoulders' rotation in place, by (3, 3, 3) for each of these."""
-        errors[self._ball_rows] = (turns @ errors.take(self._model.ball_v, axis=0)).reshape(len(self._ball_rows), -1)
 
     def densities_learnt(
         self, state: State, moved: FloatArray, variance: FloatArray, remaining: FloatArray, dt: float

@@ -251,7 +251,7 @@ class OrientationUpdate:
         # so was all, as if a camera took joints to be elsewhere at other times, which from now on it is not taken to
         if not state.sources.names and any(sensor.stated for sensor in state.sensors.values()):
             known = slice(0, self._space.observed)
-            lines = self._model.linearise(state.q, state.lengths)
+            lines = self._model.linearised(state.q, state.lengths)
             covariance[known, known] += self._displacement.covariance(
                 state.but(sources=sources), lines, self._displacement.prior_information
             )
@@ -298,7 +298,9 @@ class OrientationUpdate:
         """A state with some (n,) of its sources of orientations."""
         rows = np.concatenate([np.ones(self._space.size, dtype=np.bool_), np.repeat(kept, PER_SOURCE)])
         return state.but(
-            sources=state.sources.kept(kept), covariance=state.covariance[rows][:, rows], crosses=state.crosses[rows]
+            sources=state.sources.kept(kept),
+            covariance=state.covariance[np.ix_(rows, rows)],
+            crosses=state.crosses[rows],
         )
 
     def _thumb_table(self) -> list[IntArray]:

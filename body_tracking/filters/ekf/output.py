@@ -6,6 +6,7 @@ import numpy as np
 
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.skeleton import N_JOINTS, FloatArray, Skeleton, TrackingState
+from body_tracking.filters.ekf import kernels
 from body_tracking.filters.ekf.displacement import Displacement
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.priors import VAGUE
@@ -32,7 +33,7 @@ class Output:
         self._displacement, self._parameters = displacement, parameters
         names = space.model.coordinate_names[6:]
         self._twists = np.array([name.startswith(("shoulder_z", "forearm_pronation")) for name in names])
-        self._postural = np.append(space.prior.postural, [True] * 3)
+        self._postural = np.flatnonzero(np.append(space.prior.postural, [True] * 3))
         stddev = np.concatenate([space.prior.stddev, [np.radians(TWIST_SHARING_STDDEV)], space.prior.tilt_stddev])
         self._posture_variance = stddev[self._postural] ** 2
         self._last_handed_out: tuple[State, FloatArray, FloatArray] | None = None
@@ -62,23 +63,16 @@ class Output:
 
     def _upright(self, q: FloatArray, lengths: FloatArray, covariance: FloatArray) -> FloatArray:
         """A configuration after the posture prior; changes its covariance in place, velocities are only considered."""
-        space, prior = self._space, self._space.prior
-        known = covariance[: space.observed, : space.observed]
-        start, moved = q, np.zeros(space.nv)
-        for _ in range(_UPDATES):
-            at = prior.rows(q, self._model.linearise(q, lengths))
-            off = at.residuals[self._postural]
-            rows = np.zeros((len(off), space.observed))
-            rows[:, : space.nv] = at.gradients[self._postural]
-            cross = known @ rows.T
-            gain = np.linalg.solve(rows @ cross + np.diag(self._posture_variance), cross.T)
-            moved = (rows[:, : space.nv] @ moved - off) @ gain[:, : space.nv]
-            q = self._model.integrate(start, moved)
-        velocities = covariance[: space.observed, space.velocities]
-        velocities -= gain.T @ (rows @ velocities)
-        covariance[space.velocities, : space.observed] = velocities.T
-        known -= cross @ gain
-        return q
+        return kernels.upright(
+            q,
+            lengths,
+            covariance,
+            self._postural,
+            self._posture_variance,
+            self._model.tree,
+            self._space.prior_table,
+            _UPDATES,
+        )
 
     def _middled(self, q: FloatArray, covariance: FloatArray) -> FloatArray:
         """(35,) a configuration with covariance (32, 32), updated by the middle of the ranges where vague."""
@@ -103,14 +97,13 @@ class Output:
         """
         space = self._space
         q, known = self._handed_out(state)
-        own = np.r_[space.tangent, space.velocities]
         return ModelEstimate(
             state.stamp_ns,
             frame_id,
             body,
             q,
             state.velocity,
-            known[np.ix_(own, own)],
+            np.delete(np.delete(known, space.lengths, 0), space.lengths, 1),
             state.lengths,
             np.sqrt(known.diagonal()[space.lengths]),
         )
@@ -119,17 +112,17 @@ class Output:
         """The modelled joints, as of a frame; INFERRED where predicted, NOT_TRACKED where not modelled."""
         space = self._space
         q, covariance = self._handed_out(state)
-        lines = self._model.linearise(q, state.lengths)
-        observed = covariance[: space.observed, : space.observed]
+        lines = self._model.linearised(q, state.lengths)
         joints = self._model.joints
-        observation = space.observation(lines)
-        spread = observation @ observed @ observation.T
+        observation = lines.observation
         positions, velocities = np.full((2, N_JOINTS, 3), np.nan)
         covariances = _UNKNOWN.copy()
         states = np.zeros(N_JOINTS, dtype=np.uint8)
         positions[joints] = lines.posture.positions
         velocities[joints] = (observation[:, space.tangent] @ state.velocity).reshape(-1, 3)
-        covariances[joints] = spread.reshape(-1).take(space.own)
+        covariances[joints] = kernels.point_covariances(
+            observation, np.ascontiguousarray(covariance[: space.observed, : space.observed])
+        )
         used = state.used_ns == skeleton.stamp_ns
         states[joints] = np.where(used, skeleton.states[joints], _INFERRED)
         return Skeleton(state.stamp_ns, skeleton.frame_id, positions, states, skeleton.body, covariances, velocities)

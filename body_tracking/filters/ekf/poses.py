@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from body_tracking.core import so3
 from body_tracking.core.body_model import ModelError
 from body_tracking.core.skeleton import BONES, NANOSECONDS, BoolArray, FloatArray, Joint
-from body_tracking.filters.ekf.algebra import CLOSE, squared_distance
+from body_tracking.filters.ekf.algebra import CLOSE
+from body_tracking.filters.ekf.kernels import LEAN_FRAMES, MISFIT
 from body_tracking.filters.ekf.motion import Motion
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.sensor_errors import SensorErrors
@@ -18,7 +17,6 @@ from body_tracking.filters.ekf.state import NOBODY, Measurement, SensorState, St
 from body_tracking.kinematics.inverse import InverseKinematics
 from body_tracking.kinematics.lengths import SegmentLengths
 
-_EYE3 = np.eye(3)
 _REST_NS = NANOSECONDS // 4
 """Least time between searches for another pose."""
 _MOST_ATTEMPTS = 4
@@ -32,8 +30,6 @@ to a wrong hand, so its innovations persist."""
 _WHOLE = 15
 """Least number of points of a frame for an estimate of a person's size."""
 _MUCH_BETTER = 0.5
-_LEAN_TIME, _LEAN_FRAMES = 0.3, 4.0
-"""Seconds over which innovations are averaged, and least number in a mean."""
 _STRAINED = 4.0
 """Squared Mahalanobis distance of a mean innovation that a right pose does not reach: it stays below 1 with little
 noise and below 3 with much; a hand in the wrong elbow or wrist branch reaches 2 to 5."""
@@ -42,8 +38,6 @@ _SUSPICIOUS = 1.0
 a wrong branch, to which lengths that are still estimated adapt."""
 _LIKELIER = 3.0
 """Log likelihood ratio, half the difference of two costs, for another pose: 20 to 1."""
-_MISFIT = 0.02
-"""Metres: persistent distance of a person's points from any pose of the model."""
 _FIRST_SPEED, _FIRST_TURN_RATE = 0.3, 1.0
 """m/s and rad/s: standard deviation of the velocities of a person who is first seen."""
 _CONTRADICTION = 0.8
@@ -117,7 +111,7 @@ class PoseSearch:
     ) -> State:
         """A state at rest at a pose, as uncertain as a fit to points of this deviation (19,) leaves it."""
         space = self._space
-        lines = self._model.linearise(q, lengths)
+        lines = self._model.linearised(q, lengths)
         weights = np.where(np.isfinite(stddev), 1.0 / stddev**2, 0.0)
         by_tangent = lines.jacobian.reshape(-1, space.nv)
         by_length = lines.length_jacobian.reshape(-1, space.nl)
@@ -210,7 +204,7 @@ class PoseSearch:
     def _astray(self, state: State, measurement: Measurement, back: BoolArray) -> bool:
         """Whether an update by points (19,) that were away for long ended where they are not."""
         off = measurement.positions - self._model.forward(state.q, state.lengths).positions
-        variance = self._sensors.point_stddev(measurement, state.sensors) ** 2 + _MISFIT**2
+        variance = self._sensors.point_stddev(measurement, state.sensors) ** 2 + MISFIT**2
         return bool(((off**2).sum(axis=1) > self._gate * variance)[back].any())
 
     def _as_fitted(self, measurement: Measurement, state: State) -> tuple[FloatArray, FloatArray]:
@@ -245,43 +239,17 @@ class PoseSearch:
         fit = self.inverse.solve(points, stddev, state.lengths, fit.q)
         return self.new_state(state.stamp_ns, fit.q, state.lengths, stddev, state)
 
-    def leaning(
-        self,
-        state: State,
-        innovation: FloatArray,
-        covariance: FloatArray,
-        measured: BoolArray,
-        distances: FloatArray,
-        white: FloatArray,
-        dt: float,
-    ) -> tuple[FloatArray, FloatArray, float]:
-        """The faded mean of the innovations (19, 3), its weights (19,), and its greatest squared distance."""
-        fade = math.exp(-dt / _LEAN_TIME)
-        bounded = np.minimum(
-            1.0, np.sqrt(self._gate / np.maximum(distances, 1e-9))
-        )  # bounds the influence of an outlier
-        weight = fade * state.leaning + measured
-        step = measured / np.maximum(weight, 1.0)
-        lean = state.lean + step[:, None] * (bounded[:, None] * innovation - state.lean)
-        # variance of a faded mean of white innovations with this weight
-        worth = (0.5 + 0.5 * fade) * weight
-        # a body is no model: what is off by less than this needs no other pose
-        averaged = white * (1.0 - 1.0 / np.maximum(worth, 1.0))  # only what is white averages out
-        spread = covariance + (_MISFIT**2 - averaged)[:, None, None] * _EYE3
-        strain = np.where(weight > _LEAN_FRAMES, squared_distance(spread, lean), 0.0)
-        return lean, weight, float(strain.max())
-
     def _straightened(self, state: State, measurement: Measurement) -> State:
         """Restart the pose if another one fits the averaged points much better.
 
         A wrong pose may persist that no single frame contradicts: a straight elbow with a wrong axial rotation of the
         upper arm.
         """
-        sure = state.leaning > _LEAN_FRAMES
+        sure = state.leaning > LEAN_FRAMES
         posture = self._model.forward(state.q, state.lengths)
         points = np.where(sure[:, None], posture.positions + state.lean, np.nan)
         stddev = self._sensors.point_stddev(measurement, state.sensors)
-        stddev = np.where(np.isfinite(stddev), np.sqrt(stddev**2 / np.maximum(state.leaning, 1.0) + _MISFIT**2), np.inf)
+        stddev = np.where(np.isfinite(stddev), np.sqrt(stddev**2 / np.maximum(state.leaning, 1.0) + MISFIT**2), np.inf)
         turned = self._hands_turned(state, points, stddev)
         if turned is not state or state.strain < _STRAINED:
             return turned

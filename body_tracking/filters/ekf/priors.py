@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg.lapack import dtrtrs
 
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, SingleArray
-from body_tracking.filters.ekf.algebra import cholesky
+from body_tracking.filters.ekf.kernels import prior_rows, pseudo_measured, soft_values
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.state import State, StateSpace, single
 from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV
@@ -61,11 +60,13 @@ class Priors:
         space = self._space
         if state.since_prior < _PRIOR_PERIOD:
             return state
-        prior = self._prior.rows(state.q, self._model.linearise(state.q, state.lengths))
-        values, gradients, stddev = prior.residuals, prior.gradients, self._stddev
-        excess = self._ranges.excess_of(prior.coordinates)
+        lines, stddev = self._model.linearised(state.q, state.lengths), self._stddev
+        coordinates, values, gradients = prior_rows(
+            state.q, lines.posture.rotations[0], lines.rotation_jacobian[0], self._space.prior_table
+        )
+        excess = self._ranges.excess_of(coordinates)
         if state.sources.names:  # the posture prior is not validated with sensors whose mounting is being estimated
-            values[:-3], stddev = prior.coordinates - self._ranges.centre, self._range_stddev
+            values[:-3], stddev = coordinates - self._ranges.centre, self._range_stddev
         tangent = self._free(state)[0][space.tangent, space.tangent]
         variance = ((gradients @ tangent) * gradients).sum(axis=1)
         # A coordinate whose variance exceeds that of its prior gets a pseudo-measurement at the prior's mean, with the
@@ -119,7 +120,7 @@ class Priors:
         brought back to what the ranges of motion say.
         """
         space = self._space
-        lines = self._model.linearise(state.q, state.lengths)
+        lines = self._model.linearised(state.q, state.lengths)
         jacobian = lines.jacobian.reshape(-1, space.nv)
         if state.sources.names:
             turning = lines.rotation_jacobian[state.sources.segments].reshape(-1, space.nv)
@@ -162,7 +163,7 @@ class Priors:
         for _ in range(_PROJECTIONS):
             if self._ranges.certainly_within(state.q, _FAR_BEYOND):
                 return state
-            values = self._ranges.values(state.q)
+            values = soft_values(state.q, self._space.prior_table)
             excess = self._ranges.excess_of(values)
             size = np.abs(excess)
             far = size > _FAR_BEYOND
@@ -198,20 +199,15 @@ class Priors:
             part: the covariance, and with the slow errors of cameras: all of it, or what may be corrected.
         """
         space = self._space
-        free, free_crosses = part
-        cross_covariance = free[:, space.tangent] @ observation.T
-        s = observation @ cross_covariance[space.tangent] + np.diag(noise)
-        factor = cholesky(s)
-        gain, _ = dtrtrs(factor, cross_covariance.T, lower=1)
-        white, _ = dtrtrs(factor, error, lower=1)
-        covariance = state.covariance - gain.T @ gain
+        sound, correction, covariance, crosses = pseudo_measured(
+            state.covariance, state.crosses, *part, observation, error, noise
+        )
+        if not sound:
+            raise np.linalg.LinAlgError("not positive definite")
         if state.settled:
             covariance[space.lengths, space.lengths] = state.covariance[space.lengths, space.lengths]
-        half, _ = dtrtrs(factor, observation @ free_crosses[space.tangent], lower=1)
-        crosses = state.crosses - single(gain.T) @ single(half)
-        if state.settled:
             crosses[space.lengths] = state.crosses[space.lengths]
-        return space.moved(state.but(covariance=covariance, crosses=crosses), white @ gain)
+        return space.moved(state.but(covariance=covariance, crosses=crosses), correction)
 
     def _pushed_back(
         self, state: State, observation: FloatArray, excess: FloatArray, stddev: float = _LIMIT_STDDEV
@@ -238,7 +234,7 @@ class Priors:
         speaking = state.stamp_ns - state.sources.stamps < _HELD_FOR_NS
         if not speaking.any():
             return state.covariance, state.crosses
-        turning = self._model.linearise(state.q, state.lengths).rotation_jacobian[state.sources.segments[speaking]]
+        turning = self._model.linearised(state.q, state.lengths).rotation_jacobian[state.sources.segments[speaking]]
         rows = turning.reshape(-1, space.nv)
         cross = state.covariance[:, space.tangent] @ rows.T
         s = rows @ cross[space.tangent]

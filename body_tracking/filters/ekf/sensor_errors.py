@@ -9,7 +9,7 @@ import numpy as np
 
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray, Joint
 from body_tracking.filters.ekf.parameters import EkfParameters
-from body_tracking.filters.ekf.state import Measurement, SensorState, SlowBasis, StateSpace
+from body_tracking.filters.ekf.state import Measurement, SensorState, State, StateSpace
 
 _DIMENSIONS = 3
 _MEAN = np.full(_DIMENSIONS, 1.0 / _DIMENSIONS)
@@ -27,7 +27,6 @@ _POOL = 8.0
 """Frames from which on a point's own noise counts alone."""
 _OUTLYING = 6.0
 """A squared difference counts as at most so many times the variance."""
-NEGLIGIBLE_SLOW = 1e-3
 STRETCH = 0.1
 """Share of the length of an upper arm or forearm that a sensor, at unit scale of its slow errors, is wrong by."""
 _LEAST_STRETCH = 0.067
@@ -58,6 +57,7 @@ class SensorErrors:
         parameters: of the filter.
 
     Attributes:
+        carried: (19, 4) which points hang on each limb.
         slow_size: how many slow errors a sensor has (61): three of each point, and one of each limb.
     """
 
@@ -65,6 +65,7 @@ class SensorErrors:
         self._space, self._model, self._parameters = space, space.model, parameters
         self._limbs = tuple(f"{part}_{side}" for part in ("upper_arm", "forearm") for side in ("left", "right"))
         self._limb_points = self._limb_table()
+        self.carried = self._limb_points[2]
         self.slow_size = 3 * space.points + len(self._limbs)
 
     def unknown(self, measurement: Measurement, alone: bool = False) -> SensorState:
@@ -132,7 +133,7 @@ class SensorErrors:
         measurement: Measurement,
         whitening: FloatArray,
         white: FloatArray,
-        rows: slice | IntArray,
+        rows: IntArray,
         oriented: bool,
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """One step of maximum likelihood (Fisher scoring) for the scales of the slow variance.
@@ -149,18 +150,20 @@ class SensorErrors:
         if soon or sensor.weight.max() < 2.0 * _POOL:
             scales = _kept(sensor.slow, np.maximum(sensor.slow, least))
             return scales, sensor.slow_estimate, sensor.slow_information
-        basis = self._basis_of(measurement, measurement.positions)
-        half = np.zeros((len(white), self.slow_size))
-        half[:, rows] = whitening * basis.points[rows]
-        half[:, 3 * self._space.points :] = whitening @ basis.limbs[rows]
+        starts, ends, carried = self._limb_points
+        along = STRETCH * (measurement.positions[ends] - measurement.positions[starts])
+        limbs = (carried[:, None, :] * along.T).reshape(-1, len(self._limbs))
+        points = len(rows)
+        half = np.concatenate(
+            [whitening * np.sqrt(measurement.model_variance).repeat(3)[rows], whitening @ limbs[rows]], axis=1
+        )
         likely = white @ half
         gram = half.T @ half
         expected = gram.diagonal()
-        points = 3 * self._space.points
         squares = likely**2
         # one that is far from all others says nothing, where all are far they say much
         shares = np.sort(squares[:points] / np.maximum(expected[:points], 1e-30))
-        usual = max(1.0, float(shares[points // 2]) / _MEDIAN_OF_CHI2)  # their number is odd
+        usual = max(1.0, float(shares[points // 2]) / _MEDIAN_OF_CHI2)
         score = 0.5 * (np.minimum(squares, _SLOW_BOUND * usual * expected) - expected)
         squared = gram * gram
         scores = np.array([score[:points].sum(), score[points:].sum()])
@@ -184,26 +187,18 @@ class SensorErrors:
         """(61,) what belongs to each slow error, from (2,) what belongs to those of points and of limbs."""
         return np.repeat(scales, (3 * self._space.points, len(self._limbs)))
 
-    def slow_basis(self, scales: FloatArray, measurement: Measurement, positions: FloatArray) -> SlowBasis | None:
-        """Displacement of the points by each slow error of unit variance; None where these are negligible."""
-        if scales.max() < NEGLIGIBLE_SLOW:
-            return None
-        return self._basis_of(measurement, positions, *np.sqrt(scales))
+    def slow_stddev(self, scales: FloatArray, measurement: Measurement) -> tuple[FloatArray, FloatArray]:
+        """(19,) metres, of the slow errors of points by themselves; (4,) of those of limbs, as a share of their length.
 
-    def _basis_of(
-        self, measurement: Measurement, positions: FloatArray, of_points: float = 1.0, of_limbs: float = 1.0
-    ) -> SlowBasis:
-        """The same for slow errors of points and limbs that are so many times the stated deviations.
-
-        Each point is off by itself, and the upper arms and forearms are too long or too short in some poses, with all
-        that hangs on them: along a limb a depth sensor finds its joints by a tenth of the length nearer or farther.
+        The upper arms and forearms are too long or too short in some poses, with all that hangs on them: along a limb a
+        depth sensor finds its joints by a tenth of the length nearer or farther.
         """
-        starts, ends, beyond = self._limb_points
-        along = of_limbs * STRETCH * (positions[ends] - positions[starts])
-        return SlowBasis(
-            (of_points * np.sqrt(measurement.model_variance)).repeat(3),
-            (beyond[:, None, :] * along.T).reshape(-1, len(self._limbs)),
-        )
+        points, limbs = np.sqrt(scales)
+        return points * np.sqrt(measurement.model_variance), np.full(len(self._limbs), limbs * STRETCH)
+
+    def place_of(self, state: State, sensor: str) -> int:
+        """First column of a sensor's slow errors in ``State.crosses``."""
+        return state.slow_names.index(sensor) * self.slow_size
 
     def point_stddev(self, measurement: Measurement, sensors: Mapping[str, SensorState]) -> FloatArray:
         """(19,) metres; infinity where not measured."""

@@ -7,14 +7,14 @@ from typing import Any, Self
 
 import numpy as np
 
-from body_tracking.core.body_model import Linearisation
 from body_tracking.core.measurement import BASE_STDDEV
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray, Joint, SingleArray, Skeleton
+from body_tracking.filters.ekf.kernels import prior_table
 from body_tracking.filters.ekf.sources import Sources
+from body_tracking.kinematics.compiled_body import CompiledUpperBody
 from body_tracking.kinematics.lengths import SegmentLengths, proportions
 from body_tracking.kinematics.posture import PosturePrior
 from body_tracking.kinematics.ranges import Ranges
-from body_tracking.kinematics.upper_body import UpperBody
 
 NOBODY = Sources.none()
 
@@ -33,25 +33,6 @@ class Changeable:
         other.__dict__.update(self.__dict__)
         other.__dict__.update(changes)
         return other
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SlowBasis:
-    """Displacement (57, 61) of the points by each slow error of unit variance.
-
-    Attributes:
-        points: (57,) by those of each point alone, the diagonal of the first 57 columns.
-        limbs: (57, 4) by those of the limbs, the last columns.
-    """
-
-    points: FloatArray
-    limbs: FloatArray
-
-    def of(self, crosses: SingleArray) -> FloatArray:
-        """(n, 57) covariance with the displacement, of what has (n, 61) with the slow errors: C B^T."""
-        count = len(self.points)
-        result: FloatArray = crosses[:, :count] * self.points + crosses[:, count:] @ self.limbs.T
-        return result
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,13 +149,6 @@ class State(Changeable):
     unplaced: bool = False
     doubt: float = 0.0
 
-    def cross(self, name: str) -> SingleArray | None:
-        """(85, 61) of ``crosses``, those of one sensor; None for zero."""
-        if name not in self.slow_names:
-            return None
-        place, size = self.slow_names.index(name), self.crosses.shape[1] // len(self.slow_names)
-        return self.crosses[:, place * size : (place + 1) * size]
-
 
 class StateSpace:
     """The body model, and the indices of its parts in the state.
@@ -186,23 +160,24 @@ class StateSpace:
         model: as given.
         ranges: of its motion.
         prior: how people hold themselves.
+        prior_table: both as arrays.
         points: how many of its joints are observed (19).
         nv: dimension of the tangent space (32).
         nl: how many lengths it has (21).
         observed: of both together (53): what points depend on.
         size: of the state without any source of orientations (85).
         tangent, lengths, velocities: where these are in the state.
-        own: (19, 3, 3) indices of each point's own block in the flat covariance (57, 57) of all.
         base_variance: (19,) square metres, systematic error of a camera that states no variances.
         rest_information: (32,) prior information on the tangent.
         lengths_covariance: (21, 21) of people's lengths.
         thumbs: (12, 19) the thumb at the end of each segment, of forearms and hands.
     """
 
-    def __init__(self, model: UpperBody) -> None:
+    def __init__(self, model: CompiledUpperBody) -> None:
         self.model = model
         self.ranges = Ranges(model)
         self.prior = PosturePrior(model, self.ranges)
+        self.prior_table = prior_table(model, self.ranges, self.prior)
         self.points = len(model.joints)
         self.nv, self.nl = model.nv, len(model.length_names)
         self.observed = self.nv + self.nl
@@ -210,8 +185,6 @@ class StateSpace:
         self.tangent = slice(0, self.nv)
         self.lengths = slice(self.nv, self.observed)
         self.velocities = slice(self.observed, self.size)
-        first = 3 * np.arange(self.points)[:, None] + np.arange(3)
-        self.own: IntArray = (3 * self.points * first[:, :, None] + first[:, None, :]).astype(np.intp)
         self.base_variance = BASE_STDDEV[model.joints] ** 2
         self.rest_information = np.full(self.nv, 1e-4)
         self.rest_information[3:5] = 1.0 / self.prior.tilt_stddev.max() ** 2
@@ -231,8 +204,3 @@ class StateSpace:
             velocity=state.velocity + correction[self.velocities],
             sources=state.sources if len(correction) == self.size else state.sources.moved(correction[self.size :]),
         )
-
-    def observation(self, lines: Linearisation) -> FloatArray:
-        """(57, 53) derivative of the points by tangent and lengths."""
-        both = np.concatenate([lines.jacobian, lines.length_jacobian], axis=-1)
-        return both.reshape(-1, self.observed)

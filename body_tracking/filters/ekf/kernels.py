@@ -1,0 +1,640 @@
+"""Compiled parts of the extended filter: what takes the time of a frame."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from body_tracking.core.compiled import compiled
+from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray, SingleArray
+from body_tracking.kinematics.compiled_body import Tree, curved, integrated, linearised
+from body_tracking.kinematics.posture import PosturePrior
+from body_tracking.kinematics.ranges import Ranges
+from body_tracking.kinematics.upper_body import UpperBody
+
+_VERTICAL = 1e-9
+_SMALL = 1e-8
+_SERIES = 1e-4
+LEAN_TIME, LEAN_FRAMES = 0.3, 4.0
+"""Seconds over which innovations are averaged, and least number in a mean."""
+MISFIT = 0.02
+"""Metres: persistent distance of a person's points from any pose of the model."""
+_SUDDEN, _SUDDEN_TIME = 20.0, 0.05
+"""m/s2 that a joint may be accelerated by beyond expectation (standard deviation), and the longest time for which."""
+_DRAWING, _MOST_GROWN = 3.0, 100.0
+"""Squared Mahalanobis distance that a point is taken for which has been rejected for long; greatest inflation."""
+_BASE = 6
+_FIRST_LIMB = 6
+"""Segment whose origin is the first shoulder; then the other, both elbows, both wrists."""
+_TANGENT, _VELOCITIES = 32, 53
+
+
+class PriorTable(NamedTuple):
+    """The posture prior and the ranges of motion as arrays.
+
+    Attributes:
+        angles_q, angles: (20,) where the configuration, and the 26 coordinates, have the angles.
+        quaternions, rotations: (2,) where they have the shoulders' rotations.
+        to_centre: (2, 4) quaternions from the centre of a shoulder's reach.
+        mean: (26,) radians.
+        twist: (26,) coefficients of the sharing of the axial twist.
+    """
+
+    angles_q: IntArray
+    angles: IntArray
+    quaternions: IntArray
+    rotations: IntArray
+    to_centre: FloatArray
+    mean: FloatArray
+    twist: FloatArray
+
+
+def prior_table(model: UpperBody, ranges: Ranges, prior: PosturePrior) -> PriorTable:
+    """The table of one model."""
+    return PriorTable(
+        model.scalar_q,
+        model.scalar_v - _BASE,
+        np.array([model.quaternion_of(f"upper_arm_{side}").start for side in ("left", "right")], dtype=np.intp),
+        np.array([model.coordinate_names.index(f"shoulder_x_{side}") - _BASE for side in ("left", "right")]),
+        ranges.to_centre,
+        prior.mean,
+        ranges.twist,
+    )
+
+
+@compiled
+def soft_values(q: FloatArray, table: PriorTable) -> FloatArray:
+    """(26,) the values of ``SoftCoordinates`` at one configuration."""
+    values = np.empty(len(table.mean))
+    for number in range(len(table.angles)):
+        values[table.angles[number]] = q[table.angles_q[number]]
+    for side in range(len(table.quaternions)):
+        place, row = table.quaternions[side], table.rotations[side]
+        ax, ay, az, aw = table.to_centre[side]
+        bx, by, bz, bw = q[place], q[place + 1], q[place + 2], q[place + 3]
+        x = aw * bx + bw * ax + ay * bz - az * by
+        y = aw * by + bw * ay + az * bx - ax * bz
+        z = aw * bz + bw * az + ax * by - ay * bx
+        w = aw * bw - ax * bx - ay * by - az * bz
+        norm = math.sqrt(x * x + y * y + z * z)
+        scale = 2.0 * (math.atan2(norm, abs(w)) / norm if norm > _SMALL else 1.0)
+        if w < 0.0:
+            scale = -scale
+        values[row], values[row + 1], values[row + 2] = scale * x, scale * y, scale * z
+    return values
+
+
+@compiled
+def prior_rows(
+    q: FloatArray, rotation: FloatArray, turning: FloatArray, table: PriorTable
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Deviations from the prior's mean: 26 coordinates, the sharing of the axial twist, the pelvis's tilt.
+
+    Args:
+        q: (35,) configuration.
+        rotation: (3, 3) of the pelvis.
+        turning: (3, 32) its angular velocity per tangent velocity.
+        table: of the prior.
+
+    Returns:
+        (26,) values of ``SoftCoordinates``, (29,) residuals, (29, 32) their derivatives by the tangent.
+    """
+    values = soft_values(q, table)
+    count = len(values)
+    residuals = np.zeros(count + 3)
+    gradients = np.zeros((count + 3, turning.shape[1]))
+    for row in range(count):
+        residuals[row] = values[row] - table.mean[row]
+        residuals[count] += table.twist[row] * values[row]
+        gradients[row, _BASE + row] = 1.0
+    for side in range(len(table.rotations)):
+        row = table.rotations[side]
+        v = values[row : row + 3]
+        square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+        angle = math.sqrt(square)
+        # inverse of the right Jacobian (Sola eq. 144)
+        factor = 1.0 / 12.0 if angle < _SERIES else (1.0 - 0.5 * angle / math.tan(0.5 * angle)) / square
+        for i in range(3):
+            for j in range(3):
+                gradients[row + i, _BASE + row + j] = factor * v[i] * v[j]
+            gradients[row + i, _BASE + row + i] += 1.0 - factor * square
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            gradients[row + j, _BASE + row + k] -= 0.5 * v[i]
+            gradients[row + k, _BASE + row + j] += 0.5 * v[i]
+    for row in range(count):
+        if table.twist[row] != 0.0:
+            for column in range(turning.shape[1]):
+                gradients[count, column] += table.twist[row] * gradients[row, column]
+    # of the tilt: sines of the vertical's angles with the horizontal axes forward and to the left
+    size = max(math.sqrt(rotation[0, 1] ** 2 + rotation[1, 1] ** 2), _VERTICAL)
+    x, y = rotation[0, 1] / size, rotation[1, 1] / size
+    up = rotation[:, 2]
+    forward, left = y * up[0] - x * up[1], x * up[0] + y * up[1]
+    residuals[count + 1], residuals[count + 2] = forward, left
+    # both axes turn with the heading: (forward axis x left-right axis) / size
+    r = rotation[:, 1]
+    heading = np.array([-x * r[2], -y * r[2], y * r[1] + x * r[0]]) / size
+    by_forward = np.array([x * up[2], y * up[2], -(x * up[0] + y * up[1])])
+    by_left = np.array([-y * up[2], x * up[2], y * up[0] - x * up[1]])
+    for i in range(3):
+        by_forward[i] += left * heading[i]
+        by_left[i] -= forward * heading[i]
+    for column in range(turning.shape[1]):
+        for i in range(3):
+            gradients[count + 1, column] += by_forward[i] * turning[i, column]
+            gradients[count + 2, column] += by_left[i] * turning[i, column]
+    return values, residuals, gradients
+
+
+@compiled
+def upright(
+    q: FloatArray,
+    lengths: FloatArray,
+    covariance: FloatArray,
+    chosen: IntArray,
+    variance: FloatArray,
+    tree: Tree,
+    table: PriorTable,
+    updates: int,
+) -> FloatArray:
+    """The update by the posture prior, iterated; changes the covariance in place, velocities are only considered.
+
+    Args:
+        q: (35,) configuration.
+        lengths: (21,) metres.
+        covariance: (85, 85) of tangent, lengths and velocities.
+        chosen: (k,) rows of :func:`prior_rows`.
+        variance: (k,) of these.
+        tree: of the model.
+        table: of the prior.
+        updates: how many times it is linearised.
+
+    Returns:
+        (35,) the configuration after it.
+    """
+    size, count = tree.axes.shape[0], len(chosen)
+    known = len(covariance) - size
+    start, moved = q, np.zeros(size)
+    pose = np.ascontiguousarray(covariance[:, :size])
+    half = np.empty((count, len(covariance)))
+    for _ in range(updates):
+        _, rotations, _, _, turning = linearised(q, lengths, tree)
+        _, residuals, gradients = prior_rows(q, rotations[0], turning[0], table)
+        rows = gradients[chosen]
+        cross = np.dot(rows, pose.T)  # (k, 85)
+        s = np.dot(np.ascontiguousarray(cross[:, :size]), rows.T)
+        for k in range(count):
+            s[k, k] += variance[k]
+        off = np.dot(rows, moved) - residuals[chosen]
+        factored(s)
+        half = cross
+        forward_substituted(s, half)
+        white = off.reshape(count, 1)
+        forward_substituted(s, white)
+        for column in range(size):
+            moved[column] = 0.0
+            for k in range(count):
+                moved[column] += half[k, column] * white[k, 0]
+        q = integrated(start, moved, tree)
+    taken = np.dot(half.T, half)
+    for row in range(len(covariance)):
+        end = len(covariance) if row < known else known
+        for column in range(end):
+            covariance[row, column] -= taken[row, column]
+    return q
+
+
+@compiled
+def factored(matrix: FloatArray) -> bool:
+    """Cholesky's factor U of a symmetric matrix U^T U, in the upper triangle in place; False where there is none."""
+    size = len(matrix)
+    for k in range(size):
+        pivot = matrix[k, k]
+        if not 0.0 < pivot < math.inf:
+            return False
+        pivot = 1.0 / math.sqrt(pivot)
+        for j in range(k, size):
+            matrix[k, j] *= pivot
+        for i in range(k + 1, size):
+            factor = matrix[k, i]
+            for j in range(i, size):
+                matrix[i, j] -= factor * matrix[k, j]
+    return True
+
+
+@compiled
+def forward_substituted(factor: FloatArray, right: FloatArray) -> None:
+    """Solve U^T X = B in place, with U of :func:`factored` and (k, n) B."""
+    size, columns = right.shape
+    for k in range(size):
+        pivot = 1.0 / factor[k, k]
+        for j in range(columns):
+            right[k, j] *= pivot
+        for i in range(k + 1, size):
+            times = factor[k, i]
+            for j in range(columns):
+                right[i, j] -= times * right[k, j]
+
+
+@compiled
+def displaced(observation: FloatArray, weights: FloatArray, information: FloatArray, spread: FloatArray) -> FloatArray:
+    """(53, 53) covariance G B G^T by constant offsets, G = (H^T W H + P^-1)^-1 H^T W.
+
+    Args:
+        observation: (57, 53) H.
+        weights: (19,) diagonal of W, for each point.
+        information: (53, 53) P^-1.
+        spread: (57, 57) B.
+    """
+    weighted = observation.T.copy()
+    size = len(weighted)
+    for column in range(len(observation)):
+        for row in range(size):
+            weighted[row, column] *= weights[column // 3]
+    factor = np.dot(weighted, observation) + information
+    right = weighted
+    factored(factor)
+    forward_substituted(factor, right)
+    for k in range(size - 1, -1, -1):
+        for i in range(k + 1, size):
+            times = factor[k, i]
+            for j in range(right.shape[1]):
+                right[k, j] -= times * right[i, j]
+        pivot = 1.0 / factor[k, k]
+        for j in range(right.shape[1]):
+            right[k, j] *= pivot
+    result: FloatArray = np.dot(np.dot(right, spread), right.T)
+    return result
+
+
+@compiled
+def point_covariances(observation: FloatArray, covariance: FloatArray) -> FloatArray:
+    """(19, 3, 3) covariance of each point, of (57, 53) derivatives and the covariance (53, 53) by which they vary."""
+    half = np.dot(observation, covariance)
+    count, size = len(observation) // 3, observation.shape[1]
+    result = np.empty((count, 3, 3))
+    for point in range(count):
+        for i in range(3):
+            for j in range(i, 3):
+                total = 0.0
+                for k in range(size):
+                    total += half[3 * point + i, k] * observation[3 * point + j, k]
+                result[point, i, j] = result[point, j, i] = total
+    return result
+
+
+@compiled
+def expected(
+    q: FloatArray,
+    lengths: FloatArray,
+    positions: FloatArray,
+    covariance: FloatArray,
+    spread: FloatArray,
+    crosses: SingleArray,
+    place: int,
+    own: FloatArray,
+    along: FloatArray,
+    carried: FloatArray,
+    white: FloatArray,
+    turns: FloatArray,
+    tree: Tree,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """A frame against its prediction.
+
+    Args:
+        q: (35,) configuration about which it is linearised.
+        lengths: (21,) metres.
+        positions: (19, 3) measured points.
+        covariance: (n, n) of the state.
+        spread: (32, 32) covariance of the tangent, for what curvature adds.
+        crosses: (n, m) covariance of the state with the slow errors of all sensors.
+        place: first column of this sensor's.
+        own: (19,) deviation of the slow errors of points.
+        along: (4,) relative deviation of the length of each limb, as it is seen; 0 for none.
+        carried: (19, 4) which points each limb carries.
+        white: (19,) variance of the white noise.
+        turns: (3, 3, 3) derivatives of the free rotations' tangents at the configuration by those of the state; (0, 3,
+            3) where both are the same.
+        tree: of the model; the limbs' ends are the origins of segments 6 to 11.
+
+    Returns:
+        (57, 53) derivative of the points, (57,) innovation, (57, 57) its covariance, (n, 57) covariance of the state
+        with the innovation, (19, 3, 3) blocks of single points with what curvature adds, (19, 3, 3) the same without
+        limbs that are too long or too short, (57, 4) displacement by these.
+    """
+    points, _, axes, observation, _ = linearised(q, lengths, tree)
+    count, known = len(points), observation.shape[1]
+    size = 3 * count
+    curvature = curved(observation, axes, spread, tree)
+    number = 0
+    for segment in range(len(tree.parents)):
+        if tree.ball[segment] and number < len(turns):
+            first = tree.coordinates[segment, 0]
+            for row in range(size):
+                x, y, z = observation[row, first], observation[row, first + 1], observation[row, first + 2]
+                for i in range(3):
+                    observation[row, first + i] = (
+                        x * turns[number, 0, i] + y * turns[number, 1, i] + z * turns[number, 2, i]
+                    )
+            number += 1
+    innovation = (positions - points - curvature).reshape(-1)
+    limbs = np.zeros((size, carried.shape[1]))
+    for limb in range(carried.shape[1]):
+        if along[limb] > 0.0:
+            start, end = tree.origins[_FIRST_LIMB + limb], tree.origins[_FIRST_LIMB + 2 + limb]
+            for point in range(count):
+                for i in range(3):
+                    limbs[3 * point + i, limb] = (
+                        carried[point, limb] * along[limb] * (points[end, i] - points[start, i])
+                    )
+    cross = np.dot(np.ascontiguousarray(covariance[:, :known]), observation.T)  # P H^T
+    half = 0.5 * cross[:known]
+    # H P H^T + B C^T H^T + H C B^T + B B^T, and P H^T + C B^T
+    by_limbs = np.dot(crosses[:, place + size : place + size + limbs.shape[1]].astype(np.float64), limbs.T)
+    for row in range(len(cross)):
+        for k in range(size):
+            change = crosses[row, place + k] * own[k // 3] + by_limbs[row, k]
+            cross[row, k] += change
+            if row < known:
+                half[row, k] += change
+    product = np.dot(observation, half)
+    s = np.dot(limbs, limbs.T)
+    blocks, unstretched = np.empty((count, 3, 3)), np.empty((count, 3, 3))
+    for i in range(size):
+        for j in range(size):
+            s[i, j] += product[i, j] + product[j, i]
+        s[i, i] += white[i // 3] + own[i // 3] * own[i // 3]
+    for point in range(count):
+        for i in range(3):
+            for j in range(3):
+                # a normal error x makes x^2 / 2 of mean m and of variance 2 m^2
+                value = s[3 * point + i, 3 * point + j] + 2.0 * curvature[point, i] * curvature[point, j]
+                blocks[point, i, j] = value
+                for limb in range(limbs.shape[1]):
+                    value -= limbs[3 * point + i, limb] * limbs[3 * point + j, limb]
+                unstretched[point, i, j] = value
+    return observation, innovation, s, cross, blocks, unstretched, limbs
+
+
+@compiled
+def solved(
+    s: FloatArray, blocks: FloatArray, cross: FloatArray, innovation: FloatArray, covariance: FloatArray, rows: IntArray
+) -> tuple[bool, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """The Kalman update by some of the rows.
+
+    Args:
+        s: (57, 57) covariance of the innovation.
+        blocks: (19, 3, 3) those of single points, instead of what it has there.
+        cross: (n, 57) covariance of the state with the innovation.
+        innovation: (57,).
+        covariance: (n, n) of the state.
+        rows: (k,) those that are used, ascending.
+
+    Returns:
+        Whether s is positive definite; (k, k) W, the inverse of its lower Cholesky factor; (k, n) W C^T; (k,) the
+        normalised innovation; (n, n) the covariance after it.
+    """
+    count, size = len(rows), len(cross)
+    factor, whitening = np.empty((count, count)), np.zeros((count, count))
+    gain, white = np.empty((count, size)), np.empty((count, 1))
+    for i in range(count):
+        row = rows[i]
+        for j in range(count):
+            column = rows[j]
+            factor[i, j] = blocks[row // 3, row % 3, column % 3] if row // 3 == column // 3 else s[row, column]
+        white[i, 0] = innovation[row]
+        whitening[i, i] = 1.0
+        for j in range(size):
+            gain[i, j] = cross[j, row]
+    sound = factored(factor)
+    if sound:
+        forward_substituted(factor, gain)
+        forward_substituted(factor, white)
+        for k in range(count):
+            pivot = 1.0 / factor[k, k]
+            for j in range(k + 1):
+                whitening[k, j] *= pivot
+            for i in range(k + 1, count):
+                times = factor[k, i]
+                for j in range(k + 1):
+                    whitening[i, j] -= times * whitening[k, j]
+    return sound, whitening, gain, white.reshape(-1), covariance - np.dot(gain.T, gain)
+
+
+@compiled
+def crosses_updated(
+    crosses: SingleArray,
+    kalman: FloatArray,
+    observation: FloatArray,
+    rows: IntArray,
+    place: int,
+    own: FloatArray,
+    limbs: FloatArray,
+) -> SingleArray:
+    """(n, m) covariance of the state with considered slow errors (Schmidt 1966): C - K H C, and - K B of the sensor's.
+
+    Args:
+        crosses: (n, m) before.
+        kalman: (n, k) gain.
+        observation: (57, 53) derivative of the points.
+        rows: (k,) of it that were used.
+        place: first column of the sensor's own slow errors.
+        own: (19,) deviation of the slow errors of points.
+        limbs: (57, 4) displacement by those of limbs.
+    """
+    known, size = observation.shape[1], len(observation)
+    seen = np.dot(kalman, observation[rows]).astype(np.float32)
+    result: SingleArray = crosses - np.dot(seen, crosses[:known])
+    by_limbs = np.dot(kalman, limbs[rows])
+    for i in range(len(result)):
+        for k in range(len(rows)):
+            result[i, place + rows[k]] -= kalman[i, k] * own[rows[k] // 3]
+        for k in range(limbs.shape[1]):
+            result[i, place + size + k] -= by_limbs[i, k]
+    return result
+
+
+@compiled
+def pseudo_measured(
+    covariance: FloatArray,
+    crosses: SingleArray,
+    free: FloatArray,
+    free_crosses: SingleArray,
+    rows: FloatArray,
+    error: FloatArray,
+    noise: FloatArray,
+) -> tuple[bool, FloatArray, FloatArray, SingleArray]:
+    """The update by pseudo-measurements of the tangent.
+
+    Args:
+        covariance: (n, n) of the state.
+        crosses: (n, m) with the slow errors of cameras.
+        free: (n, n) of it what may be corrected.
+        free_crosses: (n, m) likewise.
+        rows: (k, 32) what is measured.
+        error: (k,) of it.
+        noise: (k,) variances.
+
+    Returns:
+        Whether it is sound, the correction (n,), and both covariances after it.
+    """
+    count = len(rows)
+    half = np.dot(rows, free[:_TANGENT])
+    s = np.dot(np.ascontiguousarray(half[:, :_TANGENT]), rows.T)
+    white = error.copy().reshape(count, 1)
+    for k in range(count):
+        s[k, k] += noise[k]
+    sound = factored(s)
+    if sound:
+        forward_substituted(s, half)
+        forward_substituted(s, white)
+        covariance = covariance - np.dot(half.T, half)
+        if crosses.shape[1]:
+            slow = np.dot(rows, free_crosses[:_TANGENT].astype(np.float64))
+            forward_substituted(s, slow)
+            crosses = crosses - np.dot(half.T, slow).astype(np.float32)
+    return sound, np.dot(half.T, white).reshape(-1), covariance, crosses
+
+
+@compiled
+def squared_distance(block: FloatArray, vector: FloatArray, added: float) -> float:
+    """Squared Mahalanobis distance of (3,) by (3, 3) with ``added`` on its diagonal."""
+    x, y, z = vector
+    # C = L D L^T, and L w = v
+    xx = block[0, 0] + added
+    l10, l20 = block[1, 0] / xx, block[2, 0] / xx
+    d1 = block[1, 1] + added - l10 * block[1, 0]
+    rest = block[2, 1] - l20 * block[1, 0]
+    l21 = rest / d1
+    d2 = block[2, 2] + added - l20 * block[2, 0] - l21 * rest
+    y -= l10 * x
+    z -= l20 * x + l21 * y
+    distance: float = x * x / xx + y * y / d1 + z * z / d2
+    return distance
+
+
+@compiled
+def gated(
+    innovation: FloatArray,
+    blocks: FloatArray,
+    unstretched: FloatArray,
+    measured: BoolArray,
+    white: FloatArray,
+    rejected_for: FloatArray,
+    lean: FloatArray,
+    leaning: FloatArray,
+    dt: float,
+    gate: float,
+    reacquire_after: float,
+) -> tuple[BoolArray, FloatArray, FloatArray, FloatArray, FloatArray, float]:
+    """The gate of each point, and the mean of the innovations, which shows wrong poses that no single frame shows.
+
+    Args:
+        innovation: (57,) metres.
+        blocks: (19, 3, 3) covariance of each point.
+        unstretched: (19, 3, 3) without limbs that are too long or too short: a wrong pose must not pass for these.
+        measured: (19,) which points are.
+        white: (19,) variance of the white noise.
+        rejected_for: (19,) seconds before this frame.
+        lean: (19, 3) as of the state, before it.
+        leaning: (19,) likewise.
+        dt: seconds since the sensor's last frame.
+        gate: greatest squared distance.
+        reacquire_after: seconds.
+
+    Returns:
+        (19,) which points are used, (19, 3, 3) their covariances for the update, the new ``rejected_for``, ``lean`` and
+        ``leaning``, and the greatest squared distance of a mean.
+    """
+    count = len(measured)
+    used, rejected_for = measured.copy(), rejected_for.copy()
+    blocks, lean, leaning = blocks.copy(), lean.copy(), leaning.copy()
+    fade, strain = math.exp(-dt / LEAN_TIME), 0.0
+    # a limb may set off faster than it is expected to: what it can do in the time that passed is no outlier
+    sudden = (0.5 * _SUDDEN * min(dt, _SUDDEN_TIME) ** 2) ** 2
+    for k in range(count):
+        y = innovation[3 * k : 3 * k + 3]
+        distance = squared_distance(blocks[k], y, 0.0)
+        if measured[k]:
+            if squared_distance(blocks[k], y, sudden) < gate:
+                rejected_for[k] = 0.0
+            else:
+                # what stays where the person is not believed to be, and where no other pose is found, draws it slowly
+                used[k] = rejected_for[k] > reacquire_after
+                rejected_for[k] += dt
+                if used[k]:
+                    blocks[k] *= max(1.0, min(distance / _DRAWING, _MOST_GROWN))
+        weight = fade * leaning[k] + measured[k]
+        if measured[k]:
+            bounded = min(1.0, math.sqrt(gate / max(distance, 1e-9)))  # bounds the influence of an outlier
+            for i in range(3):
+                lean[k, i] += (bounded * y[i] - lean[k, i]) / max(weight, 1.0)
+        leaning[k] = weight
+        if weight > LEAN_FRAMES:
+            # variance of a faded mean of white innovations with this weight: only what is white averages out
+            averaged = white[k] * (1.0 - 1.0 / max((0.5 + 0.5 * fade) * weight, 1.0))
+            # a body is no model: what is off by less than the misfit needs no other pose
+            strain = max(strain, squared_distance(unstretched[k], lean[k], MISFIT**2 - averaged))
+    return used, blocks, rejected_for, lean, leaning, strain
+
+
+@compiled
+def carry(part: FloatArray | SingleArray, turns: FloatArray, balls: IntArray, reach: float, fade: float) -> None:
+    """Multiply rows (85 or more, n) by the transition of the motion model from the left, in place.
+
+    Args:
+        part: rows of tangent (32), lengths, velocities (32) and more.
+        turns: (3, 3, 3) rotations of the tangents of free rotations.
+        balls: (3,) where the tangent has these.
+        reach: seconds of velocity by which positions move.
+        fade: share of the velocities that is left.
+    """
+    for k in range(len(balls)):
+        ball = balls[k]
+        for j in range(part.shape[1]):
+            x, y, z = part[ball, j], part[ball + 1, j], part[ball + 2, j]
+            for i in range(3):
+                part[ball + i, j] = turns[k, i, 0] * x + turns[k, i, 1] * y + turns[k, i, 2] * z
+    for i in range(_TANGENT):
+        for j in range(part.shape[1]):
+            part[i, j] += reach * part[_VELOCITIES + i, j]
+            part[_VELOCITIES + i, j] *= fade
+
+
+@compiled
+def transported(
+    covariance: FloatArray,
+    crosses: SingleArray,
+    turns: FloatArray,
+    balls: IntArray,
+    reach: float,
+    fade: float,
+    kept: float,
+    noise: FloatArray,
+) -> tuple[FloatArray, SingleArray]:
+    """The covariances after some time of integrated Ornstein-Uhlenbeck velocities: F P F^T + Q, and F C.
+
+    Args:
+        covariance: (n, n) of tangent (32), lengths, velocities (32) up to 85, and sources.
+        crosses: (n, m) with slow errors.
+        turns: (3, 3, 3) rotations of the tangents of free rotations.
+        balls: (3,) where the tangent has these.
+        reach: seconds of velocity by which positions move.
+        fade: what is left of velocities.
+        kept: what is left of slow errors.
+        noise: (3, 32) variances that are added: of tangent, of velocities, and their covariance.
+    """
+    p = covariance.copy()
+    c = crosses * np.float32(kept)
+    carry(p, turns, balls, reach, fade)
+    carry(p.T, turns, balls, reach, fade)
+    carry(c, turns, balls, reach, fade)
+    for i in range(noise.shape[1]):
+        p[i, i] += noise[0, i]
+        p[_VELOCITIES + i, _VELOCITIES + i] += noise[1, i]
+        p[i, _VELOCITIES + i] += noise[2, i]
+        p[_VELOCITIES + i, i] += noise[2, i]
+    return p, c
