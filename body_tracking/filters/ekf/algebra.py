@@ -1,12 +1,12 @@
-"""Small matrices, and how far a linearisation reaches."""
+"""Small matrices, compiled: triangular factors, and how far a linearisation reaches."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dtrtri
 
+from body_tracking.core.compiled import compiled
 from body_tracking.core.skeleton import FloatArray
 
 LINEARISATIONS = 4
@@ -14,26 +14,80 @@ FAR, CLOSE = 0.2, 0.05
 """Radians: a correction farther than the first is linearised anew, until it changes by less than the second."""
 
 
-def cholesky(matrix: FloatArray) -> FloatArray:
-    """The lower factor; numpy's takes three times as long on one so small.
+@compiled
+def factored(matrix: FloatArray) -> bool:
+    """Cholesky's factor U of a symmetric matrix U^T U, in the upper triangle in place; False where there is none."""
+    size = len(matrix)
+    for k in range(size):
+        pivot = matrix[k, k]
+        if not 0.0 < pivot < math.inf:
+            return False
+        pivot = 1.0 / math.sqrt(pivot)
+        for j in range(k, size):
+            matrix[k, j] *= pivot
+        for i in range(k + 1, size):
+            factor = matrix[k, i]
+            for j in range(i, size):
+                matrix[i, j] -= factor * matrix[k, j]
+    return True
+
+
+@compiled
+def forward_substituted(factor: FloatArray, right: FloatArray) -> None:
+    """Solve U^T X = B in place, with U of :func:`factored` and (k, n) B."""
+    size, columns = right.shape
+    for k in range(size):
+        pivot = 1.0 / factor[k, k]
+        for j in range(columns):
+            right[k, j] *= pivot
+        for i in range(k + 1, size):
+            times = factor[k, i]
+            for j in range(columns):
+                right[i, j] -= times * right[k, j]
+
+
+@compiled
+def invert(factor: FloatArray, inverse: FloatArray) -> None:
+    """Write (k, k) U^-T into ``inverse``, with U of :func:`factored`: with it, U^-T B is a product."""
+    size = len(factor)
+    inverse[:] = 0.0
+    for k in range(size):
+        inverse[k, k] = 1.0
+    for k in range(size):
+        pivot = 1.0 / factor[k, k]
+        for j in range(k + 1):
+            inverse[k, j] *= pivot
+        for i in range(k + 1, size):
+            times = factor[k, i]
+            for j in range(k + 1):
+                inverse[i, j] -= times * inverse[k, j]
+
+
+@compiled
+def squared_distance(block: FloatArray, vector: FloatArray, added: float) -> float:
+    """Squared Mahalanobis distance of (3,) by (3, 3) with ``added`` on its diagonal."""
+    x, y, z = vector
+    # C = L D L^T, and L w = v
+    xx = block[0, 0] + added
+    l10, l20 = block[1, 0] / xx, block[2, 0] / xx
+    d1 = block[1, 1] + added - l10 * block[1, 0]
+    rest = block[2, 1] - l20 * block[1, 0]
+    l21 = rest / d1
+    d2 = block[2, 2] + added - l20 * block[2, 0] - l21 * rest
+    y -= l10 * x
+    z -= l20 * x + l21 * y
+    distance: float = x * x / xx + y * y / d1 + z * z / d2
+    return distance
+
+
+def whitening_of(covariance: FloatArray) -> FloatArray:
+    """(k, k) inverse of the lower Cholesky factor; changes the covariance.
 
     Raises:
         LinAlgError: the matrix is not positive definite, or not finite.
     """
-    factor: FloatArray
-    # the transpose of a symmetric matrix need not be brought into Fortran's order
-    factor, failed = dpotrf(matrix.T, lower=1)
-    if failed or not math.isfinite(float(factor.trace())):
+    if not factored(covariance):
         raise np.linalg.LinAlgError("not positive definite")
-    return factor
-
-
-def whitening_of(covariance: FloatArray) -> FloatArray:
-    """(k, k) inverse of the lower factor. Products with it take a fraction of what solving takes for each.
-
-    Raises:
-        LinAlgError: as of :func:`cholesky`.
-    """
-    inverse: FloatArray
-    inverse, _ = dtrtri(cholesky(covariance), lower=1, overwrite_c=1)  # above the diagonal it stays 0
+    inverse = np.empty_like(covariance)
+    invert(covariance, inverse)
     return inverse

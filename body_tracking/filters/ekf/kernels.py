@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from body_tracking.core.compiled import compiled
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray, SingleArray
+from body_tracking.filters.ekf.algebra import factored, forward_substituted, invert, squared_distance
 from body_tracking.kinematics.compiled_body import Tree, curved, integrated, linearised
-from body_tracking.kinematics.posture import PosturePrior
-from body_tracking.kinematics.ranges import Ranges
-from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.kinematics.compiled_posture import PriorTable, prior_rows
 
-_VERTICAL = 1e-9
-_SMALL = 1e-8
-_SERIES = 1e-4
 LEAN_TIME, LEAN_FRAMES = 0.3, 4.0
 """Seconds over which innovations are averaged, and least number in a mean."""
 MISFIT = 0.02
@@ -25,128 +20,9 @@ _SUDDEN, _SUDDEN_TIME = 20.0, 0.05
 """m/s2 that a joint may be accelerated by beyond expectation (standard deviation), and the longest time for which."""
 _DRAWING, _MOST_GROWN = 3.0, 100.0
 """Squared Mahalanobis distance that a point is taken for which has been rejected for long; greatest inflation."""
-_BASE = 6
 _FIRST_LIMB = 6
 """Segment whose origin is the first shoulder; then the other, both elbows, both wrists."""
 _TANGENT, _VELOCITIES = 32, 53
-
-
-class PriorTable(NamedTuple):
-    """The posture prior and the ranges of motion as arrays.
-
-    Attributes:
-        angles_q, angles: (20,) where the configuration, and the 26 coordinates, have the angles.
-        quaternions, rotations: (2,) where they have the shoulders' rotations.
-        to_centre: (2, 4) quaternions from the centre of a shoulder's reach.
-        mean: (26,) radians.
-        twist: (26,) coefficients of the sharing of the axial twist.
-    """
-
-    angles_q: IntArray
-    angles: IntArray
-    quaternions: IntArray
-    rotations: IntArray
-    to_centre: FloatArray
-    mean: FloatArray
-    twist: FloatArray
-
-
-def prior_table(model: UpperBody, ranges: Ranges, prior: PosturePrior) -> PriorTable:
-    """The table of one model."""
-    return PriorTable(
-        model.scalar_q,
-        model.scalar_v - _BASE,
-        np.array([model.quaternion_of(f"upper_arm_{side}").start for side in ("left", "right")], dtype=np.intp),
-        np.array([model.coordinate_names.index(f"shoulder_x_{side}") - _BASE for side in ("left", "right")]),
-        ranges.to_centre,
-        prior.mean,
-        ranges.twist,
-    )
-
-
-@compiled
-def soft_values(q: FloatArray, table: PriorTable) -> FloatArray:
-    """(26,) the values of ``SoftCoordinates`` at one configuration."""
-    values = np.empty(len(table.mean))
-    for number in range(len(table.angles)):
-        values[table.angles[number]] = q[table.angles_q[number]]
-    for side in range(len(table.quaternions)):
-        place, row = table.quaternions[side], table.rotations[side]
-        ax, ay, az, aw = table.to_centre[side]
-        bx, by, bz, bw = q[place], q[place + 1], q[place + 2], q[place + 3]
-        x = aw * bx + bw * ax + ay * bz - az * by
-        y = aw * by + bw * ay + az * bx - ax * bz
-        z = aw * bz + bw * az + ax * by - ay * bx
-        w = aw * bw - ax * bx - ay * by - az * bz
-        norm = math.sqrt(x * x + y * y + z * z)
-        scale = 2.0 * (math.atan2(norm, abs(w)) / norm if norm > _SMALL else 1.0)
-        if w < 0.0:
-            scale = -scale
-        values[row], values[row + 1], values[row + 2] = scale * x, scale * y, scale * z
-    return values
-
-
-@compiled
-def prior_rows(
-    q: FloatArray, rotation: FloatArray, turning: FloatArray, table: PriorTable
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Deviations from the prior's mean: 26 coordinates, the sharing of the axial twist, the pelvis's tilt.
-
-    Args:
-        q: (35,) configuration.
-        rotation: (3, 3) of the pelvis.
-        turning: (3, 32) its angular velocity per tangent velocity.
-        table: of the prior.
-
-    Returns:
-        (26,) values of ``SoftCoordinates``, (29,) residuals, (29, 32) their derivatives by the tangent.
-    """
-    values = soft_values(q, table)
-    count = len(values)
-    residuals = np.zeros(count + 3)
-    gradients = np.zeros((count + 3, turning.shape[1]))
-    for row in range(count):
-        residuals[row] = values[row] - table.mean[row]
-        residuals[count] += table.twist[row] * values[row]
-        gradients[row, _BASE + row] = 1.0
-    for side in range(len(table.rotations)):
-        row = table.rotations[side]
-        v = values[row : row + 3]
-        square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
-        angle = math.sqrt(square)
-        # inverse of the right Jacobian (Sola eq. 144)
-        factor = 1.0 / 12.0 if angle < _SERIES else (1.0 - 0.5 * angle / math.tan(0.5 * angle)) / square
-        for i in range(3):
-            for j in range(3):
-                gradients[row + i, _BASE + row + j] = factor * v[i] * v[j]
-            gradients[row + i, _BASE + row + i] += 1.0 - factor * square
-        for i in range(3):
-            j, k = (i + 1) % 3, (i + 2) % 3
-            gradients[row + j, _BASE + row + k] -= 0.5 * v[i]
-            gradients[row + k, _BASE + row + j] += 0.5 * v[i]
-    for row in range(count):
-        if table.twist[row] != 0.0:
-            for column in range(turning.shape[1]):
-                gradients[count, column] += table.twist[row] * gradients[row, column]
-    # of the tilt: sines of the vertical's angles with the horizontal axes forward and to the left
-    size = max(math.sqrt(rotation[0, 1] ** 2 + rotation[1, 1] ** 2), _VERTICAL)
-    x, y = rotation[0, 1] / size, rotation[1, 1] / size
-    up = rotation[:, 2]
-    forward, left = y * up[0] - x * up[1], x * up[0] + y * up[1]
-    residuals[count + 1], residuals[count + 2] = forward, left
-    # both axes turn with the heading: (forward axis x left-right axis) / size
-    r = rotation[:, 1]
-    heading = np.array([-x * r[2], -y * r[2], y * r[1] + x * r[0]]) / size
-    by_forward = np.array([x * up[2], y * up[2], -(x * up[0] + y * up[1])])
-    by_left = np.array([-y * up[2], x * up[2], y * up[0] - x * up[1]])
-    for i in range(3):
-        by_forward[i] += left * heading[i]
-        by_left[i] -= forward * heading[i]
-    for column in range(turning.shape[1]):
-        for i in range(3):
-            gradients[count + 1, column] += by_forward[i] * turning[i, column]
-            gradients[count + 2, column] += by_left[i] * turning[i, column]
-    return values, residuals, gradients
 
 
 @compiled
@@ -205,38 +81,6 @@ def upright(
         for column in range(end):
             covariance[row, column] -= taken[row, column]
     return q
-
-
-@compiled
-def factored(matrix: FloatArray) -> bool:
-    """Cholesky's factor U of a symmetric matrix U^T U, in the upper triangle in place; False where there is none."""
-    size = len(matrix)
-    for k in range(size):
-        pivot = matrix[k, k]
-        if not 0.0 < pivot < math.inf:
-            return False
-        pivot = 1.0 / math.sqrt(pivot)
-        for j in range(k, size):
-            matrix[k, j] *= pivot
-        for i in range(k + 1, size):
-            factor = matrix[k, i]
-            for j in range(i, size):
-                matrix[i, j] -= factor * matrix[k, j]
-    return True
-
-
-@compiled
-def forward_substituted(factor: FloatArray, right: FloatArray) -> None:
-    """Solve U^T X = B in place, with U of :func:`factored` and (k, n) B."""
-    size, columns = right.shape
-    for k in range(size):
-        pivot = 1.0 / factor[k, k]
-        for j in range(columns):
-            right[k, j] *= pivot
-        for i in range(k + 1, size):
-            times = factor[k, i]
-            for j in range(columns):
-                right[i, j] -= times * right[k, j]
 
 
 @compiled
@@ -398,7 +242,7 @@ def solved(
         normalised innovation; (n, n) the covariance after it.
     """
     count, size = len(rows), len(cross)
-    factor, whitening = np.empty((count, count)), np.zeros((count, count))
+    factor, whitening = np.empty((count, count)), np.empty((count, count))
     gain, white = np.empty((count, size)), np.empty((count, 1))
     for i in range(count):
         row = rows[i]
@@ -406,21 +250,13 @@ def solved(
             column = rows[j]
             factor[i, j] = blocks[row // 3, row % 3, column % 3] if row // 3 == column // 3 else s[row, column]
         white[i, 0] = innovation[row]
-        whitening[i, i] = 1.0
         for j in range(size):
             gain[i, j] = cross[j, row]
     sound = factored(factor)
     if sound:
         forward_substituted(factor, gain)
         forward_substituted(factor, white)
-        for k in range(count):
-            pivot = 1.0 / factor[k, k]
-            for j in range(k + 1):
-                whitening[k, j] *= pivot
-            for i in range(k + 1, count):
-                times = factor[k, i]
-                for j in range(k + 1):
-                    whitening[i, j] -= times * whitening[k, j]
+        invert(factor, whitening)
     return sound, whitening, gain, white.reshape(-1), covariance - np.dot(gain.T, gain)
 
 
@@ -497,23 +333,6 @@ def pseudo_measured(
             forward_substituted(s, slow)
             crosses = crosses - np.dot(half.T, slow).astype(np.float32)
     return sound, np.dot(half.T, white).reshape(-1), covariance, crosses
-
-
-@compiled
-def squared_distance(block: FloatArray, vector: FloatArray, added: float) -> float:
-    """Squared Mahalanobis distance of (3,) by (3, 3) with ``added`` on its diagonal."""
-    x, y, z = vector
-    # C = L D L^T, and L w = v
-    xx = block[0, 0] + added
-    l10, l20 = block[1, 0] / xx, block[2, 0] / xx
-    d1 = block[1, 1] + added - l10 * block[1, 0]
-    rest = block[2, 1] - l20 * block[1, 0]
-    l21 = rest / d1
-    d2 = block[2, 2] + added - l20 * block[2, 0] - l21 * rest
-    y -= l10 * x
-    z -= l20 * x + l21 * y
-    distance: float = x * x / xx + y * y / d1 + z * z / d2
-    return distance
 
 
 @compiled

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, SingleArray
-from body_tracking.filters.ekf.kernels import prior_rows, pseudo_measured, soft_values
+from body_tracking.filters.ekf.kernels import pseudo_measured
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.state import State, StateSpace, single
+from body_tracking.kinematics.compiled_posture import prior_rows, soft_values
 from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV
 
 _PRIOR_PERIOD = 0.1

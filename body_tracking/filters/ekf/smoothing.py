@@ -18,10 +18,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg.lapack import dtrtrs
 
 from body_tracking.core.skeleton import FloatArray, IntArray, Skeleton
-from body_tracking.filters.ekf.algebra import cholesky
+from body_tracking.filters.ekf.algebra import factored, forward_substituted
 from body_tracking.filters.ekf.motion import Motion
 from body_tracking.filters.ekf.state import State, StateSpace
 from body_tracking.filters.smoothing import backward_gain, smoothed_covariance
@@ -104,7 +103,10 @@ class Smoother:
             persisting[len(rest) :, : len(rest)] = crosses[rest].T
             persisting.reshape(-1)[:: count + 1] *= 1.0 + _LEAST_SHARE
             cross = np.concatenate([state.covariance[np.ix_(rest, own)], crosses[own].T])
-            white, _ = dtrtrs(cholesky(persisting), cross, lower=1)
+            if not factored(persisting):
+                raise np.linalg.LinAlgError("not positive definite")
+            white = cross
+            forward_substituted(persisting, white)
             free -= white.T @ white
         free.reshape(-1)[:: len(own) + 1] += _LEAST_SHARE * state.covariance.diagonal()[own]
         return free

@@ -9,9 +9,9 @@ import numpy as np
 
 from body_tracking.core.measurement import BASE_STDDEV
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray, Joint, SingleArray, Skeleton
-from body_tracking.filters.ekf.kernels import prior_table
 from body_tracking.filters.ekf.sources import Sources
 from body_tracking.kinematics.compiled_body import CompiledUpperBody
+from body_tracking.kinematics.compiled_posture import prior_table
 from body_tracking.kinematics.lengths import SegmentLengths, proportions
 from body_tracking.kinematics.posture import PosturePrior
 from body_tracking.kinematics.ranges import Ranges
