@@ -72,8 +72,8 @@ for _row, (_names, _, _) in enumerate(_MADE_OF.values()):
 _BEHIND: FloatArray = np.array([behind for _, behind, _ in _MADE_OF.values()])
 _DISPLACED: FloatArray = np.array([displaced for _, _, displaced in _MADE_OF.values()])
 
-# Joints of the trunk that no landmark is at, as weights of the middles of the shoulders and of the hips, and by how many
-# metres per axis they are displaced. A Kinect's SpineMid divides the line between them so, in real people.
+# Joints of the trunk that no landmark is at, as weights of the middles of the shoulders and of the hips, and by how
+# many metres per axis they are displaced. A Kinect's SpineMid divides the line between them so, in real people.
 _TRUNK: Final[dict[Joint, tuple[float, float, float]]] = {
     Joint.SPINE_BASE: (0.0, 1.0, 0.02),
     Joint.SPINE_MID: (0.578, 0.422, 0.05),
