@@ -40,6 +40,7 @@ setup(
         share("config", "*.yaml"),
         share("config/robots", "*.yaml"),
         share("config/marker_setup", "*.yaml"),
+        share("config/camera_rig", "*.yaml"),
         share("launch", "*.launch.py"),
         share("rviz", "*.rviz"),
         share("foxglove", "*.json"),

@@ -49,7 +49,7 @@ GROUPS = {
         "rigid_body_tracker",
     ),
     "Depth cameras": ("mesh_tracker",),
-    "Colour-and-depth cameras": ("camera_skeleton",),
+    "Colour cameras": ("camera_skeleton", "camera_rig"),
     "Calibration and fusion": ("calibration", "fusion"),
     "Recordings": ("bag_player", "bag_recorder"),
     "Views": ("body_markers", "viewer"),

@@ -15,6 +15,9 @@ if importlib.util.find_spec("ai_edge_litert") is None:
 REASON = f"absent: {', '.join(MISSING)} (pip install ai-edge-litert; body_tracking camera model)"
 
 
+NODES = ("camera_skeleton", "camera_rig")
+
+
 def startable(executables: Sequence[str]) -> tuple[str, ...]:
-    """The nodes that can start here: without the networks all but one."""
-    return tuple(name for name in executables if not MISSING or name != "camera_skeleton")
+    """The nodes that can start here: without the networks all but two."""
+    return tuple(name for name in executables if not MISSING or name not in NODES)

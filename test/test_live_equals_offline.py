@@ -55,6 +55,8 @@ MESH = "mesh_reaching"
 """The recording of depth images."""
 CAMERA = "camera_reaching"
 """The recording of colour and depth images."""
+CAMERAS = "cameras_turning"
+"""The recording of two colour cameras."""
 SMOOTHED = "wave with a lag"
 SAME = 1e-4
 """Metres, radians and the like by which live and offline may differ: far less than anything is known to. They are equal
@@ -198,8 +200,13 @@ CASES = [
     *((SMOOTHED, each) for each in ("ekf", "lkf_constant_velocity")),
     (MARKERS, ""),
     (MESH, ""),
-    *((CAMERA, "") for _ in range(not MISSING)),
-    *((bag.name, each) for bag in sorted(BAGS.iterdir()) if bag.name not in (MARKERS, CAMERA) for each in FILTERS),
+    *((name, "") for name in (CAMERA, CAMERAS) if not MISSING),
+    *(
+        (bag.name, each)
+        for bag in sorted(BAGS.iterdir())
+        if bag.name not in (MARKERS, CAMERA, CAMERAS)
+        for each in FILTERS
+    ),
 ]
 
 
@@ -221,6 +228,10 @@ def played(tmp_path_factory: pytest.TempPathFactory, wave: Path) -> Callable[[st
         elif name == CAMERA:
             bag = beginning(bag, folder / "excerpt", 2.0)
             arguments = ("--camera", "camera1", "--compressed", "colour", "--params-file", parameters(folder))
+        elif name == CAMERAS:
+            bag = beginning(bag, folder / "excerpt", 2.0)
+            arguments = ("--camera-rig", ROOT / "config" / "camera_rig", "--compressed", "colour")
+            arguments += ("--params-file", parameters(folder))
         else:
             arguments = ("--filter", filter_name, "--params-file", parameters(folder))
             arguments += ("--lag", "0.15") if name == SMOOTHED else ()

@@ -19,13 +19,13 @@ from body_tracking.core.camera import Camera
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray, Joint, SingleArray, Skeleton, TrackingState
 from body_tracking.mesh.depth import axial_noise
 
-_BODY_SIDE: Final = 2.2
+BODY_SIDE: Final = 2.2
 """Metres: side of the region around an upright person, which the landmarks' errors are proportional to."""
-_ACROSS: Final = 0.016
-"""Metres: standard deviation of a landmark across the line of sight, per axis, in a region of :data:`_BODY_SIDE`: 95 %
+ACROSS: Final = 0.016
+"""Metres: standard deviation of a landmark across the line of sight, per axis, in a region of :data:`BODY_SIDE`: 95 %
 of the landmarks are within a fifth of the trunk's length, as published for this network (Grishchenko et al. 2022,
 arXiv:2206.11678, table 2), most of them much nearer."""
-_HIDDEN: Final = 7.0
+HIDDEN: Final = 7.0
 """Factor on it for a landmark that the network guesses."""
 _ALONG: Final = 0.02
 """Metres: standard deviation of the depth of a joint's centre behind the surface: people and clothes differ."""
@@ -39,7 +39,7 @@ _WINDOW: Final = 0.03
 _EXPECTED: Final = 0.25
 """Metres by which a joint's surface may be off the depth that is expected."""
 _LEAST_PIXELS: Final = 4
-_SEEN: Final = 0.5
+SEEN: Final = 0.5
 """Least probability that a landmark is visible, or in the image."""
 _FLAT_POINTS: Final = 200
 _FLAT: Final = 0.005
@@ -125,18 +125,18 @@ def lift(found: Landmarks, depth: SingleArray, camera: Camera) -> Lifted | None:
     focal = float(camera.matrix[0, 0])
     pixels, world = _WEIGHTS @ found.pixels, _WEIGHTS @ found.world
     visible = np.min(np.where(_WEIGHTS > 0.0, found.visible, 1.0), axis=1)
-    present = np.min(np.where(_WEIGHTS > 0.0, found.present, 1.0), axis=1) > _SEEN
+    present = np.min(np.where(_WEIGHTS > 0.0, found.present, 1.0), axis=1) > SEEN
     present &= camera.contains(pixels)
     expected = trunk + world[:, 2] - found.world[_TORSO, 2].mean()
     surface, spread = np.full(len(_JOINTS), np.nan), np.zeros(len(_JOINTS))
     for k in np.flatnonzero(present & (expected > _WINDOW)):
         surface[k], spread[k] = _surface_near(depth, pixels[k], float(expected[k]), _WINDOW * focal / expected[k])
     # where the network guesses, what is measured may be in front of the joint
-    seen = np.isfinite(surface) & (visible > _SEEN)
+    seen = np.isfinite(surface) & (visible > SEEN)
     rays = np.concatenate([camera.undistort(pixels), np.ones((len(pixels), 1))], axis=1)
     positions = rays * (np.where(seen, surface, expected) + _BEHIND)[:, None]
-    scale = found.region.side * trunk / focal / _BODY_SIDE
-    across = _ACROSS * scale * np.where(seen, 1.0, _HIDDEN)
+    scale = found.region.side * trunk / focal / BODY_SIDE
+    across = ACROSS * scale * np.where(seen, 1.0, HIDDEN)
     doubt = np.where(seen, _DISAGREED * np.abs(surface - expected), 0.0)
     along = np.where(seen, np.sqrt(_ALONG**2 + spread**2 + doubt**2), _GUESSED_ALONG)
     unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
@@ -144,6 +144,24 @@ def lift(found: Landmarks, depth: SingleArray, camera: Camera) -> Lifted | None:
     covariances = (across**2)[:, None, None] * (np.eye(3) - outer) + (along**2)[:, None, None] * outer
     covariances += (_DISPLACED**2)[:, None, None] * np.eye(3)
     return _whole(positions, covariances, seen, present & np.isfinite(positions).all(axis=1))
+
+
+def joints_of(points: FloatArray, covariances: FloatArray, sure: BoolArray) -> Lifted:
+    """The joints of a person whose landmarks are known in space.
+
+    Args:
+        points: (33, 3) metres; NaN where unknown.
+        covariances: (33, 3, 3) square metres.
+        sure: (33,) landmarks that are seen, not guessed.
+    """
+    used = _WEIGHTS > 0.0
+    known = np.array([bool(np.isfinite(points[row]).all()) for row in used])
+    places = _WEIGHTS @ np.where(np.isfinite(points), points, 0.0)
+    # the errors of the landmarks of one joint are alike
+    spread = np.einsum("jl,lab->jab", _WEIGHTS, np.where(np.isfinite(covariances), covariances, 0.0))
+    spread += (_DISPLACED**2)[:, None, None] * np.eye(3)
+    seen = np.array([bool(sure[row].all()) for row in used])
+    return _whole(places, spread, seen, known)
 
 
 def trunk_depth(found: Landmarks, depth: SingleArray) -> float | None:
@@ -156,7 +174,7 @@ def trunk_depth(found: Landmarks, depth: SingleArray) -> float | None:
 def is_flat(found: Landmarks, depth: SingleArray, camera: Camera) -> bool:
     """Whether the person is a picture: the surface of trunk and joints lies in a plane."""
     mask = _trunk_mask(found, depth.shape)
-    inside = camera.contains(found.pixels) & (found.visible > _SEEN)
+    inside = camera.contains(found.pixels) & (found.visible > SEEN)
     columns, rows = np.round(found.pixels[inside]).astype(np.intp).T
     mask[rows, columns] = True
     rows, columns = np.nonzero(mask & (depth > 0.0))
@@ -180,7 +198,7 @@ def _trunk_mask(found: Landmarks, shape: tuple[int, ...]) -> BoolArray:
     inner = np.round(middle + 0.8 * (corners - middle)).astype(np.int32)
     cv2.fillConvexPoly(mask, cv2.convexHull(inner), 1)
     ends = [tuple(np.round(middle + 0.7 * (end - middle)).astype(int).tolist()) for end in (top, bottom)]
-    cv2.line(mask, ends[0], ends[1], 1, max(1, round(_SPINE * found.region.side / _BODY_SIDE)))
+    cv2.line(mask, ends[0], ends[1], 1, max(1, round(_SPINE * found.region.side / BODY_SIDE)))
     return mask.astype(np.bool_)
 
 

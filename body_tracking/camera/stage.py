@@ -66,12 +66,12 @@ _DEPTH_POSE = Parameter(
 MODEL = Parameter(
     "model", "", "folder of the networks (`body_tracking camera model` fetches them); empty for the user's cache"
 )
-_PEOPLE = Parameter("people", 1, "the largest number of people per camera", min=1, max=6)
-_SEARCH = Parameter("search_every", 0.3, "time between two searches for more people", "s", 0.0, 10.0)
+PEOPLE = Parameter("people", 1, "the largest number of people per camera", min=1, max=6)
+SEARCH = Parameter("search_every", 0.3, "time between two searches for more people", "s", 0.0, 10.0)
 _TOLERANCE = Parameter(
     "tolerance", 0.02, "largest difference between the stamps of a colour and a depth image of one time", "s", 0.0, 0.5
 )
-_THREADS = Parameter("threads", 1, "processors that a network may use", min=1, max=16)
+THREADS = Parameter("threads", 1, "processors that a network may use", min=1, max=16)
 
 _COLOUR, _DEPTH = "colour", "depth"
 _KEPT: Final = 64
@@ -95,10 +95,10 @@ class CameraStage(Stage):
         _COMPRESSED,
         _DEPTH_POSE,
         MODEL,
-        _PEOPLE,
-        _SEARCH,
+        PEOPLE,
+        SEARCH,
         _TOLERANCE,
-        _THREADS,
+        THREADS,
         TRANSPORT,
     )
 

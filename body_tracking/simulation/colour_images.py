@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from body_tracking.core.camera import Camera
+from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import FloatArray, IntArray, SingleArray
 from body_tracking.core.sources import optical_frame
 from body_tracking.mesh.raster import render
@@ -45,7 +46,8 @@ class Painter:
 
     Attributes:
         scene: of a person in a room.
-        camera: at the place of the scene's depth camera.
+        camera: intrinsics.
+        pose: of the camera in ``world``.
         faces: (F, 3) of the body without the strands of hair, which would hide the face of the person.
         colours: (F, 3) red, green, blue of each of them.
         background: (height, width, 3) the room.
@@ -54,34 +56,37 @@ class Painter:
 
     scene: DepthScene
     camera: Camera
+    pose: SensorPose
     faces: IntArray
     colours: FloatArray
     background: FloatArray
     distance: SingleArray
 
     @classmethod
-    def of(cls, scene: DepthScene, camera: Camera | None = None) -> Painter:
-        """With colours drawn by the scene's seed; the scene's own camera where none is given."""
-        camera = camera or scene.camera
+    def of(cls, scene: DepthScene, camera: Camera | None = None, pose: SensorPose | None = None) -> Painter:
+        """With colours drawn by the scene's seed; the scene's own camera at its own place where none is given."""
+        camera, pose = camera or scene.camera, pose or scene.pose
         vertices, faces = scene.room()
-        room = render(vertices, faces, camera)
+        world = scene.pose.apply(vertices)
+        room = render((world - pose.translation) @ pose.rotation, faces, camera)
         wall, floor = np.array([172.0, 178.0, 170.0]), np.array([124.0, 108.0, 92.0])
         rows = np.arange(camera.height)[:, None, None] / camera.height
         background = np.tile(wall * (1.0 - 0.15 * rows), (1, camera.width, 1))
-        heights = (scene.pose.apply(vertices)[faces, 2]).max(axis=1)
+        heights = world[faces, 2].max(axis=1)
         background[(room.faces >= 0) & (heights[room.faces] < _ON_FLOOR)] = floor
         rng = np.random.default_rng([scene.seed, 20250101])
         background += rng.normal(scale=_NOISE, size=background.shape)
         body = scene.who.body
         shown = body.materials != HAIR
-        return cls(scene, camera, body.faces[shown], _colours(body, rng)[shown], background, room.depth)
+        return cls(scene, camera, pose, body.faces[shown], _colours(body, rng)[shown], background, room.depth)
 
     def image(self, frame: DepthFrame) -> NDArray[np.uint8]:
         """(height, width, 3) red, green, blue of a frame of the scene."""
-        own = render(frame.vertices, self.faces, self.camera)
+        vertices = (self.scene.pose.apply(frame.vertices) - self.pose.translation) @ self.pose.rotation
+        own = render(vertices, self.faces, self.camera)
         seen = (own.depth > 0.0) & ((self.distance == 0.0) | (own.depth < self.distance))
         face = own.faces[seen]
-        direction = normals(frame.vertices, self.faces)[self.faces[face]].mean(axis=1)
+        direction = normals(vertices, self.faces)[self.faces[face]].mean(axis=1)
         light = _AMBIENT + (1.0 - _AMBIENT) * np.clip(direction @ (_LAMP / np.linalg.norm(_LAMP)), 0.0, 1.0)
         picture = self.background.copy()
         picture[seen] = self.colours[face] * light[:, None]

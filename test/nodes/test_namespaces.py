@@ -38,6 +38,7 @@ NEEDED: dict[str, dict[str, object]] = {
     "bag_player": {"bag": BAG},
     "mesh_tracker": {"depth": "[kinect1]"},
     "camera_skeleton": {"cameras": "[camera1]"},
+    "camera_rig": {"setup": ROOT / "config" / "camera_rig"},
     "bag_recorder": {"start_recording": False},
     "viewer": {"port": 0},
     **{name: {"setup": ROOT / "config" / "marker_setup"} for name in MARKER_NODES},

@@ -18,7 +18,7 @@ MARKER_NODES = (
     "rigid_body_tracker",
     "marker_joint_angles",
 )
-LACKING = ("robot_commands", "bag_player", "kinect_skeleton", "mesh_tracker", "camera_skeleton")
+LACKING = ("robot_commands", "bag_player", "kinect_skeleton", "mesh_tracker", "camera_skeleton", "camera_rig")
 """Nodes that do nothing without a parameter."""
 NODES = startable(systems.EXECUTABLES)
 
@@ -36,6 +36,7 @@ class AllNodes:
             "bag_player": {"bag": bag, "topics": "[/kinect2/skeleton]", "start_paused": "true"},
             "mesh_tracker": {"depth": "[kinect1]"},
             "camera_skeleton": {"cameras": "[camera1]"},
+            "camera_rig": {"setup": tools.share / "config" / "camera_rig"},
             "bag_recorder": {"folder": "recording", "start_recording": "false"},
             "viewer": {"port": 0},
             **{name: {"setup": tools.share / "config" / "marker_setup"} for name in MARKER_NODES},

@@ -1,0 +1,160 @@
+"""Colour images of calibrated cameras to skeletons, without depth: the stage of the node ``camera_rig``."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from body_tracking.camera.codecs import ColourImage, CompressedColour
+from body_tracking.camera.model_files import default_folder
+from body_tracking.camera.numbers import PersonNumbers
+from body_tracking.camera.people import PersonTracker
+from body_tracking.camera.pose_model import ImageArray, PoseModel
+from body_tracking.camera.stage import DRIVER, MODEL, PEOPLE, SEARCH, THREADS
+from body_tracking.camera.topics import COMPRESSED, DRIVERS, RIG_SENSOR
+from body_tracking.camera.triangulation import match, triangulate
+from body_tracking.core.parameters import Parameter, Value
+from body_tracking.core.skeleton import NANOSECONDS, Skeleton
+from body_tracking.core.sources import optical_frame
+from body_tracking.markers import setup
+from body_tracking.markers.pairing import FrameSets
+from body_tracking.markers.rig_storage import load_rig
+from body_tracking.mesh.depth import DepthError, check_size
+from body_tracking.mesh.topics import IMAGES
+from body_tracking.messages.codecs import Codec, Skeletons
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.shared import RELIABLE as TRANSPORT
+from body_tracking.pipeline.shared import skeleton_qos
+from body_tracking.pipeline.stage import Now, Output, Port, Stage
+
+RIG = Parameter("setup", "", "folder with rig.yaml, the cameras' calibration (body_tracking markers calibrate or wand)")
+_COLOUR_TOPIC = Parameter(
+    "colour_topic", "", "topic of the colour images, with {camera} for the camera's name; empty for that of the driver"
+)
+_COMPRESSED = Parameter("compressed", False, "take the images that image_transport has compressed (JPEG or PNG)")
+_TOLERANCE = Parameter("tolerance", 0.01, "largest difference between the stamps of images of one time", "s", 0.0, 0.5)
+_WAIT_NS: Final = NANOSECONDS // 10
+"""Longest wait of an image for the others."""
+_KEPT: Final = 64
+"""Images of a topic that wait with the parameter ``reliable``."""
+
+
+class RigStage(Stage):
+    """Finds people in the colour images of calibrated cameras, and triangulates their joints."""
+
+    NAME = "camera_rig"
+    PARAMETERS = (RIG, DRIVER, _COLOUR_TOPIC, _COMPRESSED, MODEL, PEOPLE, SEARCH, _TOLERANCE, THREADS, TRANSPORT)
+
+    def __init__(self, values: Mapping[str, Value], wanted: Callable[[str], bool] = lambda topic: True) -> None:
+        super().__init__(values, wanted)
+        self._rig = load_rig(setup.file_of(values["setup"], setup.RIG, "calibrate"))
+        names = [setup.camera_name(camera.frame_id) for camera in self._rig.cameras]
+        if len(names) < 2:
+            raise graph.GraphError(f"setup: {', '.join(names)} alone; two cameras or more are needed")
+        model = PoseModel(
+            Path(str(values["model"])).expanduser() if values["model"] else default_folder(),
+            int(str(values["threads"])),
+        )
+        people, search = int(str(values["people"])), float(str(values["search_every"]))
+        self._trackers = {name: PersonTracker(model, people, search) for name in names}
+        self._cameras = dict(zip(names, self._rig.cameras, strict=True))
+        self._numbers = PersonNumbers(people)
+        self._counters: Counter[str] = Counter()
+        self._problems: dict[str, str] = {}
+        self._people = 0
+        tolerance_ns = round(float(str(values["tolerance"])) * NANOSECONDS)
+        self._sets: FrameSets[tuple[int, ImageArray]] = FrameSets(names, tolerance_ns, _WAIT_NS)
+        compressed = bool(values["compressed"])
+        pattern = str(values["colour_topic"]) or DRIVERS[str(values["driver"])].colour
+        topics = [pattern.replace("{camera}", name) + COMPRESSED * compressed for name in names]
+        if len(set(topics)) < len(topics):
+            raise graph.GraphError(f"colour_topic: {pattern} is the same of all cameras; {{camera}} is their name")
+        self._by_topic = dict(zip(topics, names, strict=True))
+        codec: Codec = CompressedColour() if compressed else ColourImage()
+        # with `reliable` nothing is left out, however long it takes
+        leave_out = not values["reliable"]
+        self.inputs = tuple(
+            Port(
+                *(topic, codec, IMAGES, 0 if leave_out else _KEPT),
+                droppable=leave_out,
+                perishable=leave_out,
+                foreign=True,
+            )
+            for topic in topics
+        )
+        self._topic = graph.skeleton_topic(RIG_SENSOR)
+        self.outputs = (Port(self._topic, Skeletons(), skeleton_qos(values), measured=True),)
+
+    def take(self, topic: str, payload: Any, now: Now) -> Iterable[Output]:
+        stamp_ns, _, pixels = payload
+        name = self._by_topic[topic]
+        self._problems.pop(name, None)
+        try:
+            check_size(pixels[..., 0], self._cameras[name])
+        except DepthError as error:
+            self._counters[f"{name} images of another size"] += 1
+            self._problems[name] = str(error)
+            raise
+        return self._outputs(self._sets.push(name, stamp_ns, (stamp_ns, pixels), now.steady_ns))
+
+    def poll(self, steady_ns: int) -> Iterable[Output]:
+        return self._outputs(self._sets.poll(steady_ns))
+
+    @property
+    def deadline_ns(self) -> int | None:
+        return self._sets.deadline_ns
+
+    def _outputs(self, sets: Iterable[Mapping[str, tuple[int, ImageArray]]]) -> Iterator[Output]:
+        for images in sets:
+            skeletons = self._skeletons(images)
+            if skeletons:
+                yield Output(self._topic, skeletons, skeletons[0].stamp_ns)
+
+    def _skeletons(self, images: Mapping[str, tuple[int, ImageArray]]) -> tuple[Skeleton, ...]:
+        self._counters["sets of images"] += 1
+        stamp_ns = min(stamp for stamp, _ in images.values())
+        found = [
+            tracker.update(stamp_ns, images[name][1]) if name in images else {}
+            for name, tracker in self._trackers.items()
+        ]
+        matched = match(self._rig, found)
+        self._counters["people seen by one camera alone"] += sum(map(len, found)) - sum(map(len, matched))
+        bodies = [triangulate(self._rig, views) for views in matched]
+        numbers = self._numbers.of([body.positions for body in bodies])
+        self._people = len(bodies)
+        frame = optical_frame(RIG_SENSOR)
+        return tuple(
+            body.skeleton(stamp_ns, frame, number)
+            for body, number in zip(bodies, numbers, strict=True)
+            if (body.states > 0).any()
+        )
+
+    def refused(self, topic: str) -> None:
+        """Count a message of another encoding."""
+        self._counters[f"{self._by_topic[topic]} messages that cannot be used"] += 1
+
+    def reset(self, topic: str) -> None:
+        """Forget the people and the images."""
+        self._sets.reset()
+        self._numbers = PersonNumbers(self._numbers.most)
+        for tracker in self._trackers.values():
+            tracker.reset()
+
+    def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
+        """A camera whose images do not come, come at other times or in another size is named."""
+        problems = [f"{name}: {text}" for name, text in self._problems.items()]
+        if self._sets.problem():
+            problems.append(self._sets.problem())
+        return (1 if problems else 0), "; ".join(problems), {"people": self._people}
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        of_cameras = {
+            f"{name} {key}": count
+            for name, tracker in self._trackers.items()
+            for key, count in tracker.counters.items()
+        }
+        own = {"incomplete sets": self._sets.incomplete, "late images": self._sets.late}
+        return {**self._counters, **own, **of_cameras}
