@@ -3,7 +3,8 @@
 The network sees rendered images of MakeHuman's people in clothes whom nothing was fitted to; the depth images have the
 errors of a Kinect v2. Errors of shoulders, elbows and wrists against the true joints as they are, and without each
 joint's constant offset; share of true joints inside of the stated 95 % ellipsoid, and mean squared error in stated
-deviations per axis. With --pair by two such cameras without depth, 69 degrees apart. With real images: the joints that a Kinect reported for the frame of ../shared/data/kinect_depth.
+deviations per axis. With --pair by two such cameras without depth, 69 degrees apart. With real images: the joints that
+a Kinect reported for the frame of ../shared/data/kinect_depth.
 """
 
 from __future__ import annotations
