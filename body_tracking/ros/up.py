@@ -73,7 +73,7 @@ START_DELAY = 5.0
 CANNOT_START = 2
 """Exit code of a node that cannot start; its last line of output states the reason."""
 
-STOP_TIMEOUT = 8.0
+STOP_TIMEOUT = 12.0
 """Seconds for a node to end after a signal."""
 
 FINISH_TIMEOUT = 60.0
