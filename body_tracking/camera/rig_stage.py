@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,7 +11,8 @@ from body_tracking.camera.codecs import ColourImage, CompressedColour
 from body_tracking.camera.model_files import default_folder
 from body_tracking.camera.numbers import PersonNumbers
 from body_tracking.camera.people import PersonTracker
-from body_tracking.camera.pose_model import ImageArray, PoseModel
+from body_tracking.camera.pictures import RATE, Pictures
+from body_tracking.camera.pose_model import ImageArray, Landmarks, PoseModel
 from body_tracking.camera.stage import DRIVER, MODEL, PEOPLE, SEARCH, THREADS
 from body_tracking.camera.topics import COMPRESSED, DRIVERS, RIG_SENSOR
 from body_tracking.camera.triangulation import match, triangulate
@@ -45,7 +46,7 @@ class RigStage(Stage):
     """Finds people in the colour images of calibrated cameras, and triangulates their joints."""
 
     NAME = "camera_rig"
-    PARAMETERS = (RIG, DRIVER, _COLOUR_TOPIC, _COMPRESSED, MODEL, PEOPLE, SEARCH, _TOLERANCE, THREADS, TRANSPORT)
+    PARAMETERS = (RIG, DRIVER, _COLOUR_TOPIC, _COMPRESSED, MODEL, PEOPLE, SEARCH, _TOLERANCE, THREADS, RATE, TRANSPORT)
 
     def __init__(self, values: Mapping[str, Value], wanted: Callable[[str], bool] = lambda topic: True) -> None:
         super().__init__(values, wanted)
@@ -85,7 +86,9 @@ class RigStage(Stage):
             for topic in topics
         )
         self._topic = graph.skeleton_topic(RIG_SENSOR)
-        self.outputs = (Port(self._topic, Skeletons(), skeleton_qos(values), measured=True),)
+        self._pictures = {name: Pictures(name, float(str(values["picture_rate"])), wanted) for name in names}
+        skeletons = Port(self._topic, Skeletons(), skeleton_qos(values), measured=True)
+        self.outputs = (skeletons, *(port for each in self._pictures.values() for port in each.ports))
 
     def take(self, topic: str, payload: Any, now: Now) -> Iterable[Output]:
         stamp_ns, _, pixels = payload
@@ -108,17 +111,20 @@ class RigStage(Stage):
 
     def _outputs(self, sets: Iterable[Mapping[str, tuple[int, ImageArray]]]) -> Iterator[Output]:
         for images in sets:
-            skeletons = self._skeletons(images)
+            stamp_ns = min(stamp for stamp, _ in images.values())
+            found = [
+                tracker.update(stamp_ns, images[name][1]) if name in images else {}
+                for name, tracker in self._trackers.items()
+            ]
+            skeletons = self._skeletons(stamp_ns, found)
             if skeletons:
-                yield Output(self._topic, skeletons, skeletons[0].stamp_ns)
+                yield Output(self._topic, skeletons, stamp_ns)
+            for name, people in zip(self._trackers, found, strict=True):
+                if name in images:
+                    yield from self._pictures[name].of(stamp_ns, images[name][1], people.values())
 
-    def _skeletons(self, images: Mapping[str, tuple[int, ImageArray]]) -> tuple[Skeleton, ...]:
+    def _skeletons(self, stamp_ns: int, found: Sequence[Mapping[int, Landmarks]]) -> tuple[Skeleton, ...]:
         self._counters["sets of images"] += 1
-        stamp_ns = min(stamp for stamp, _ in images.values())
-        found = [
-            tracker.update(stamp_ns, images[name][1]) if name in images else {}
-            for name, tracker in self._trackers.items()
-        ]
         matched = match(self._rig, found)
         self._counters["people seen by one camera alone"] += sum(map(len, found)) - sum(map(len, matched))
         bodies = [triangulate(self._rig, views) for views in matched]

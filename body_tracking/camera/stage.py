@@ -15,7 +15,8 @@ from body_tracking.camera.codecs import ColourImage, CompressedColour, Compresse
 from body_tracking.camera.lifting import is_flat, lift
 from body_tracking.camera.model_files import default_folder
 from body_tracking.camera.people import PersonTracker
-from body_tracking.camera.pose_model import ImageArray, PoseModel
+from body_tracking.camera.pictures import RATE, Pictures
+from body_tracking.camera.pose_model import ImageArray, Landmarks, PoseModel
 from body_tracking.camera.registration import Registration, moved
 from body_tracking.camera.topics import COMPRESSION, DRIVERS, CameraTopics, images_of
 from body_tracking.core.camera import Camera, CameraError
@@ -99,6 +100,7 @@ class CameraStage(Stage):
         SEARCH,
         _TOLERANCE,
         THREADS,
+        RATE,
         TRANSPORT,
     )
 
@@ -114,7 +116,12 @@ class CameraStage(Stage):
         tolerance_ns = round(float(str(values["tolerance"])) * NANOSECONDS)
         self._cameras = {
             name: ColourAndDepth(
-                name, topics_of(name, values), PersonTracker(model, people, search), pose, tolerance_ns
+                name,
+                topics_of(name, values),
+                PersonTracker(model, people, search),
+                Pictures(name, float(str(values["picture_rate"])), wanted),
+                pose,
+                tolerance_ns,
             )
             for name in names
         }
@@ -139,7 +146,7 @@ class CameraStage(Stage):
         self.inputs = tuple(inputs)
         self.outputs = tuple(
             Port(graph.skeleton_topic(name), Skeletons(), skeleton_qos(values), measured=True) for name in names
-        )
+        ) + tuple(port for camera in self._cameras.values() for port in camera.pictures.ports)
 
     def take(self, topic: str, payload: Any, now: Now) -> Iterable[Output]:
         camera, what = self._by_topic[topic]
@@ -147,16 +154,11 @@ class CameraStage(Stage):
             camera.calibrate(what.removesuffix(" info"), payload)
             return ()
         stamp_ns, _, pixels = payload
-        return self._outputs(camera, camera.push(what, stamp_ns, pixels, now.steady_ns))
+        return camera.push(what, stamp_ns, pixels, now.steady_ns)
 
     def poll(self, steady_ns: int) -> Iterable[Output]:
         for camera in self._cameras.values():
-            yield from self._outputs(camera, camera.poll(steady_ns))
-
-    @staticmethod
-    def _outputs(camera: ColourAndDepth, found: Iterable[tuple[Skeleton, ...]]) -> Iterator[Output]:
-        for skeletons in found:
-            yield Output(graph.skeleton_topic(camera.name), skeletons, skeletons[0].stamp_ns)
+            yield from camera.poll(steady_ns)
 
     @property
     def deadline_ns(self) -> int | None:
@@ -194,6 +196,7 @@ class ColourAndDepth:
         name: of the sensor.
         topics: on which it publishes.
         tracker: of the people in its colour images.
+        pictures: of them.
         pose: of the depth camera in the colour camera's frame; None where the depth images are registered.
         tolerance_ns: largest difference between the stamps of images of one time.
 
@@ -207,10 +210,11 @@ class ColourAndDepth:
         name: str,
         topics: CameraTopics,
         tracker: PersonTracker,
+        pictures: Pictures,
         pose: SensorPose | None,
         tolerance_ns: int,
     ) -> None:
-        self.name, self.topics, self.tracker = name, topics, tracker
+        self.name, self.topics, self.tracker, self.pictures = name, topics, tracker, pictures
         self.counters: Counter[str] = Counter()
         self.people = 0
         self._pose, self._problem = pose, ""
@@ -251,17 +255,17 @@ class ColourAndDepth:
         self._problem = ""
         self._registration = Registration(depth, colour, self._pose)
 
-    def push(self, what: str, stamp_ns: int, pixels: Any, now_ns: int) -> Iterator[tuple[Skeleton, ...]]:
-        """Take an image; returns the skeletons of each time that has both images now.
+    def push(self, what: str, stamp_ns: int, pixels: Any, now_ns: int) -> Iterator[Output]:
+        """Take an image; returns the outputs of each time that has both images now.
 
         Raises:
             DepthError: an image of another size than that of its calibration.
         """
-        return self._skeletons(self._sets.push(what, stamp_ns, (stamp_ns, pixels), now_ns))
+        return self._outputs(self._sets.push(what, stamp_ns, (stamp_ns, pixels), now_ns))
 
-    def poll(self, now_ns: int) -> Iterator[tuple[Skeleton, ...]]:
+    def poll(self, now_ns: int) -> Iterator[Output]:
         """The same for images that have waited for long enough."""
-        return self._skeletons(self._sets.poll(now_ns))
+        return self._outputs(self._sets.poll(now_ns))
 
     @property
     def deadline_ns(self) -> int | None:
@@ -273,14 +277,19 @@ class ColourAndDepth:
         self.tracker.reset()
         self.people = 0
 
-    def _skeletons(self, sets: Iterable[Mapping[str, Any]]) -> Iterator[tuple[Skeleton, ...]]:
+    def _outputs(self, sets: Iterable[Mapping[str, Any]]) -> Iterator[Output]:
         for images in sets:
             (stamp_ns, colour), (_, depth) = images[_COLOUR], images[_DEPTH]
-            skeletons = self._people_in(stamp_ns, colour, depth)
+            landmarks: dict[int, Landmarks] = {}
+            skeletons = self._people_in(stamp_ns, colour, depth, landmarks)
             if skeletons:
-                yield skeletons
+                yield Output(graph.skeleton_topic(self.name), skeletons, stamp_ns)
+            yield from self.pictures.of(stamp_ns, colour, landmarks.values())
 
-    def _people_in(self, stamp_ns: int, colour: ImageArray, depth: SingleArray) -> tuple[Skeleton, ...]:
+    def _people_in(
+        self, stamp_ns: int, colour: ImageArray, depth: SingleArray, landmarks: dict[int, Landmarks]
+    ) -> tuple[Skeleton, ...]:
+        """The people with depth; ``landmarks`` gets those of everybody in the colour image."""
         self.people = 0
         if self._registration is None:
             self.counters["images without camera_info"] += 1
@@ -297,8 +306,9 @@ class ColourAndDepth:
         seen = self._registration(depth)
         source, camera = self._infos[_COLOUR], self._registration.camera
         found = []
-        for number, landmarks in self.tracker.update(stamp_ns, colour).items():
-            there = moved(landmarks, source, camera)
+        landmarks |= self.tracker.update(stamp_ns, colour)
+        for number, each in landmarks.items():
+            there = moved(each, source, camera)
             if is_flat(there, seen, camera):
                 self.counters["pictures of people"] += 1
                 self._problem = FLAT

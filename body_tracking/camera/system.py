@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from pathlib import Path
 
-from body_tracking.camera.topics import COMPRESSION, DRIVERS, RIG_SENSOR, CameraTopics, images_of
-from body_tracking.core.message_types import POINT_CLOUD
+from body_tracking.camera.topics import COMPRESSION, DRIVERS, RIG_SENSOR, CameraTopics, images_of, people_topic
+from body_tracking.core.message_types import COMPRESSED_IMAGE, POINT_CLOUD
 from body_tracking.core.parameters import Value
+from body_tracking.core.qos import RELIABLE
 from body_tracking.markers.setup import camera_names
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.system import (
@@ -19,6 +20,7 @@ from body_tracking.pipeline.system import (
     Place,
     System,
     TopicSpec,
+    View,
     asked,
     transport,
 )
@@ -39,15 +41,22 @@ def _rig(options: Options) -> tuple[str, ...]:
     return (RIG_SENSOR,) if options["camera_rig"] else ()
 
 
+def _pictures(options: Options) -> dict[str, Value]:
+    """For the page."""
+    return {"picture_rate": 5.0} if options["viewer"] else {}
+
+
 def _specs(options: Options) -> Iterable[NodeSpec]:
     if options["camera_rig"]:
         wanted = asked(options, setup="camera_rig", driver="driver", model="pose_model")
         packed = {"compressed": True} if options["compressed"] in ("colour", "both") else {}
-        yield NodeSpec("camera_rig", "camera_rig", parameters={**wanted, **packed, **transport(options)})
+        given = {**wanted, **packed, **transport(options)}
+        yield NodeSpec("camera_rig", "camera_rig", defaults=_pictures(options), parameters=given)
     if _cameras(options):
         chosen = asked(options, driver="driver", model="pose_model", compressed="compressed")
         given: dict[str, Value] = {"cameras": _cameras(options), **chosen}
-        yield NodeSpec("camera_skeleton", "camera_skeleton", parameters={**given, **transport(options)})
+        given |= transport(options)
+        yield NodeSpec("camera_skeleton", "camera_skeleton", defaults=_pictures(options), parameters=given)
 
 
 def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
@@ -139,6 +148,18 @@ SYSTEM = System(
             "camera_rig",
             "the same of the people whom two or more cameras of a rig see, in the frame of its first camera",
         ),
+        TopicSpec(
+            people_topic("<camera>"),
+            COMPRESSED_IMAGE,
+            RELIABLE,
+            "camera_skeleton",
+            "the colour images of each camera of either node with the people drawn in, left orange and right blue, "
+            "JPEG; with the parameter `picture_rate`, which `--viewer` sets, and only while there is a subscriber",
+        ),
+    ),
+    views=(
+        View("camera", "body_tracking.viewing.camera_view:CameraView"),
+        View("camera_rig", "body_tracking.viewing.camera_view:RigView"),
     ),
     commands=(
         Command("camera", "body_tracking.recording.camera_commands", "fetch the networks, and draw what they find"),

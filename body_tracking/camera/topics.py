@@ -46,6 +46,8 @@ RIG_SENSOR: Final = "camera_rig"
 """The sensor whose skeletons are triangulated, in the frame of the rig's first camera."""
 COMPRESSION: Final = ("none", "colour", "both")
 """Which images are compressed."""
+PICTURE_WIDTH: Final = 640
+"""Pixels of a picture with people drawn in, at most."""
 COMPRESSED: Final = "/compressed"
 """After the topic of colour images that image_transport compresses."""
 COMPRESSED_DEPTH: Final = "/compressedDepth"
@@ -56,3 +58,8 @@ def images_of(topics: CameraTopics, compressed: str) -> tuple[str, str]:
     """The topics of colour and depth images, of which ``none``, ``colour`` or ``both`` are compressed."""
     colour = topics.colour if compressed == "none" else topics.colour + COMPRESSED
     return colour, topics.depth + COMPRESSED_DEPTH if compressed == "both" else topics.depth
+
+
+def people_topic(camera: str) -> str:
+    """The colour images with the people drawn in, as JPEG."""
+    return f"/{camera}/people/image_raw{COMPRESSED}"

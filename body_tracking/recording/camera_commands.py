@@ -11,55 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from body_tracking.camera import model_files
-from body_tracking.camera.pose_model import Landmark, Landmarks, PoseModel
+from body_tracking.camera.picture import draw
+from body_tracking.camera.pose_model import Landmarks, PoseModel
 from body_tracking.core.errors import BodyTrackingError
 
-_BONES: Final = (
-    *(
-        (f"{one}_{side}", f"{other}_{side}")
-        for side in ("LEFT", "RIGHT")
-        for one, other in (
-            ("SHOULDER", "ELBOW"),
-            ("ELBOW", "WRIST"),
-            ("WRIST", "INDEX_FINGER"),
-            ("SHOULDER", "HIP"),
-            ("HIP", "KNEE"),
-            ("KNEE", "ANKLE"),
-            ("ANKLE", "TOES"),
-        )
-    ),
-    ("SHOULDER_LEFT", "SHOULDER_RIGHT"),
-    ("HIP_LEFT", "HIP_RIGHT"),
-)
-_LEFT, _RIGHT, _GUESSED = (255, 140, 0), (0, 170, 255), (160, 160, 160)
 _ROUNDS: Final = 3
 """Searches of a region in a single image, each from where the last one ended, as in a video."""
 
 
 class CameraCommandError(BodyTrackingError):
     """An image cannot be read or written."""
-
-
-def draw(image: NDArray[np.uint8], found: Landmarks) -> None:
-    """Draw a person into an image (height, width, 3) of red, green, blue: left orange, right blue, guessed grey."""
-    thick = max(1, round(found.region.side / 250))
-
-    def place(landmark: Landmark) -> tuple[int, int]:
-        x, y = np.round(found.pixels[landmark]).astype(int).tolist()
-        return x, y
-
-    def colour(*landmarks: Landmark) -> tuple[int, int, int]:
-        if min(found.visible[each] for each in landmarks) < 0.5:
-            return _GUESSED
-        return _LEFT if landmarks[0].name.endswith("LEFT") else _RIGHT
-
-    for names in _BONES:
-        one, other = (Landmark[name] for name in names)
-        if min(found.present[one], found.present[other]) > 0.5:
-            cv2.line(image, place(one), place(other), colour(one, other), thick, cv2.LINE_AA)
-    for landmark in Landmark:
-        if found.present[landmark] > 0.5:
-            cv2.circle(image, place(landmark), thick + 1, colour(landmark), -1, cv2.LINE_AA)
 
 
 def people_in(image: NDArray[np.uint8], model: PoseModel, people: int) -> list[Landmarks]:

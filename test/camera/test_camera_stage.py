@@ -11,7 +11,7 @@ from camera_recording import BAG, NAMES, recording
 
 from body_tracking.camera.pose_model import PoseModel, PoseModelError
 from body_tracking.camera.stage import CameraStage
-from body_tracking.camera.topics import COMPRESSED, COMPRESSED_DEPTH
+from body_tracking.camera.topics import COMPRESSED, COMPRESSED_DEPTH, people_topic
 from body_tracking.core.camera import Camera, CameraError
 from body_tracking.core.parameters import check_all
 from body_tracking.core.skeleton import Joint, Skeleton, TrackingState
@@ -163,6 +163,27 @@ def test_a_jump_back_forgets_the_people() -> None:
     node.reset(NAMES.colour)
     assert len(show(node, stamps[0], recorded.colour[stamps[0]], recorded.depth[stamps[0]])) == 1
     assert node.counters["camera1 searches for people"] == 2
+
+
+@networks
+def test_pictures_are_published_at_their_rate_while_somebody_looks() -> None:
+    recorded, wanted = recording(), set[str]()
+    values = check_all(CameraStage.PARAMETERS, {"cameras": ("camera1",), "picture_rate": 5.0})
+    node = CameraStage(values, lambda topic: topic in wanted)
+    node.take(NAMES.colour_info, recorded.colour_camera, now(0))
+    node.take(NAMES.depth_info, recorded.depth_camera, now(0))
+    stamps, pictures = list(recorded.colour)[:15], []
+    for round_ in range(2):
+        for stamp_ns in stamps:
+            at_ns = stamp_ns + round_ * 1_000_000_000
+            node.take(NAMES.colour, (at_ns, "camera1", recorded.colour[stamp_ns]), now(at_ns))
+            found = node.take(NAMES.depth, (at_ns, "camera1", recorded.depth[stamp_ns]), now(at_ns))
+            pictures += [output for output in found if output.topic == people_topic("camera1")]
+        assert len(pictures) == 5 * round_
+        wanted.add(people_topic("camera1"))
+    changed = pictures[0].payload[2] != recorded.colour[stamps[0]]
+    assert 0.001 < changed.any(axis=2).mean() < 0.1  # a skeleton is drawn in
+    assert not any(port.topic == people_topic("camera1") for port in stage().outputs)
 
 
 @networks
