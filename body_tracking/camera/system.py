@@ -48,15 +48,16 @@ def _pictures(options: Options) -> dict[str, Value]:
 
 def _specs(options: Options) -> Iterable[NodeSpec]:
     if options["camera_rig"]:
-        wanted = asked(options, setup="camera_rig", driver="driver", model="pose_model")
-        packed = {"compressed": True} if options["compressed"] in ("colour", "both") else {}
-        given = {**wanted, **packed, **transport(options)}
-        yield NodeSpec("camera_rig", "camera_rig", defaults=_pictures(options), parameters=given)
+        rig: dict[str, Value] = {**asked(options, setup="camera_rig", driver="driver", model="pose_model")}
+        if options["compressed"] in ("colour", "both"):
+            rig["compressed"] = True
+        rig |= transport(options)
+        yield NodeSpec("camera_rig", "camera_rig", defaults=_pictures(options), parameters=rig)
     if _cameras(options):
-        chosen = asked(options, driver="driver", model="pose_model", compressed="compressed")
-        given: dict[str, Value] = {"cameras": _cameras(options), **chosen}
-        given |= transport(options)
-        yield NodeSpec("camera_skeleton", "camera_skeleton", defaults=_pictures(options), parameters=given)
+        own: dict[str, Value] = {"cameras": _cameras(options)}
+        own |= asked(options, driver="driver", model="pose_model", compressed="compressed")
+        own |= transport(options)
+        yield NodeSpec("camera_skeleton", "camera_skeleton", defaults=_pictures(options), parameters=own)
 
 
 def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
