@@ -55,6 +55,11 @@ class CompressedColour(Codec):
             raise MessageError(f"image of {pixels.shape} cannot be written as JPEG")
         return _compressed(data.tobytes(), stamp_ns, frame_id, "rgb8; jpeg compressed bgr8", wire)
 
+    @staticmethod
+    def packed(data: bytes, stamp_ns: int, frame_id: str, form: str, wire: Wire) -> bytes:
+        """The message of an image that is compressed already: ``form`` is ``jpeg`` or ``png``."""
+        return _compressed(data, stamp_ns, frame_id, f"rgb8; {form} compressed bgr8", wire)
+
     def decode(self, cdr: bytes, wire: Wire) -> Colour:
         message = wire.deserialize(COMPRESSED_IMAGE, cdr)
         pixels = _decoded(memoryview(message.data), cv2.IMREAD_COLOR, str(message.format))

@@ -43,6 +43,7 @@ from body_tracking.messages.angles import angles_to_joint_states
 from body_tracking.messages.imus import sample_to_messages
 from body_tracking.messages.skeletons import skeletons_to_cloud
 from body_tracking.pipeline.graph import DEFAULT_BODY, TRUE_ANGLES
+from body_tracking.recording.image_folder import import_folder, is_image_folder
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter
 
@@ -302,7 +303,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "the time of receipt. Formats: docs/recordings.md.",
     )
     parser.add_argument(
-        "files", nargs="+", type=Path, metavar="FILE", help=".csv, .csv.gz, .skeleton, .mvnx, .mvnx.gz, .c3d"
+        "files",
+        nargs="+",
+        type=Path,
+        metavar="FILE",
+        help=".csv, .csv.gz, .skeleton, .mvnx, .mvnx.gz, .c3d, or a folder of colour and depth images",
     )
     parser.add_argument("-o", "--output", required=True, type=Path, metavar="BAG", help="the bag (a folder) to make")
     parser.add_argument(
@@ -327,6 +332,20 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         metavar="METRES",
         help="standard deviation of each coordinate of these points (default %(default)s)",
     )
+    parser.add_argument(
+        "--rate",
+        type=float,
+        default=30.0,
+        metavar="HZ",
+        help="images a second of a folder whose files have no stamps as names (default %(default)s)",
+    )
+    parser.add_argument(
+        "--depth-scale",
+        type=float,
+        default=1000.0,
+        metavar="N",
+        help="numbers to a metre in its depth images (default %(default)s: millimetres)",
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace an existing bag")
     parser.add_argument("--partial", action="store_true", help="import the complete part of files that are cut off")
     parser.add_argument("--json", action="store_true", help="print what was imported as JSON")
@@ -335,6 +354,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """``body_tracking import``."""
+    if any(map(is_image_folder, args.files)):
+        if len(args.files) > 1:
+            raise ImportFileError(f"{args.files[0]}: a folder of images is imported alone")
+        camera = _parse_sensors(args.sensor, args.files).get(args.files[0], "camera1")
+        given = args.files[0], args.output, camera, args.rate, args.depth_scale
+        print(import_folder(*given, overwrite=args.overwrite))
+        return 0
     report = import_files(
         args.files,
         args.output,

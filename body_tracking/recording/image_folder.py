@@ -1,0 +1,206 @@
+"""Folders of colour and depth images with intrinsics, as a bag of compressed images.
+
+::
+
+    FOLDER/rgb/ (or color/)   JPEG or PNG files
+    FOLDER/depth/             PNG files of 16 bits, registered to the colour images; may be absent
+    FOLDER/camera_info.yaml   intrinsics of the colour images, as ROS's camera_calibration writes them
+    FOLDER/depth_info.yaml    of the depth images, where these are not those of the colour images by their size
+
+A file's name is its stamp in seconds where it has a decimal point (``1305031102.175304.png``, as in the RGB-D benchmark
+of the TU Munich); other files are numbered through at a given rate. Files go into the bag as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+
+from body_tracking.camera.codecs import CompressedColour, CompressedDepth
+from body_tracking.camera.topics import COMPRESSED, COMPRESSED_DEPTH, DRIVERS
+from body_tracking.core import files
+from body_tracking.core.camera import MODELS, Camera, CameraError
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.message_types import COMPRESSED_IMAGE
+from body_tracking.core.qos import LATCHED
+from body_tracking.core.skeleton import MAX_STAMP_NS, NANOSECONDS
+from body_tracking.core.sources import check_sensor_name, optical_frame
+from body_tracking.mesh.codecs import DepthInfo
+from body_tracking.mesh.topics import IMAGES
+from body_tracking.messages.cameras import CAMERA_INFO
+from body_tracking.recording.progress import Progress
+from body_tracking.recording.rosbag2 import BAG_WIRE, BagWriter
+
+_COLOUR: Final = ("rgb", "color", "colour")
+_SUFFIXES: Final = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
+_MILLIMETRES: Final = 1000.0
+_LARGEST: Final = 64 << 20
+"""Bytes of an image file."""
+
+
+class ImageFolderError(BodyTrackingError):
+    """The folder has no images, no intrinsics, or a file of it cannot be used; the text names it."""
+
+
+def is_image_folder(path: Path) -> bool:
+    """Whether a path is a folder with a folder of colour images."""
+    return any((path / name).is_dir() for name in _COLOUR)
+
+
+def import_folder(
+    folder: Path, bag_folder: Path, camera: str, rate: float, depth_scale: float, *, overwrite: bool = False
+) -> str:
+    """Write the images of a folder as a bag.
+
+    Args:
+        folder: the images.
+        bag_folder: to be written.
+        camera: the sensor's name.
+        rate: images a second, where the files' names are no stamps.
+        depth_scale: of a depth image's numbers to a metre.
+        overwrite: replace a bag that is there.
+
+    Returns:
+        What was written, in one line.
+
+    Raises:
+        ImageFolderError: see there; no bag is left then.
+        SensorNameError: an invalid name.
+        BagError: the bag cannot be written.
+    """
+    names, frame = DRIVERS["plain"].of(check_sensor_name(camera)), optical_frame(camera)
+    colour_folder = next((folder / name for name in _COLOUR if (folder / name).is_dir()), None)
+    if colour_folder is None:
+        raise ImageFolderError(f"{folder}: no folder {' or '.join(_COLOUR)}")
+    if not (np.isfinite(rate) and rate > 0.0 and np.isfinite(depth_scale) and depth_scale > 0.0):
+        raise ImageFolderError(f"rate {rate} and depth scale {depth_scale}: expected positive numbers")
+    colour, depth = _stamped(colour_folder, rate), _stamped(folder / "depth", rate)
+    if not colour:
+        raise ImageFolderError(f"{colour_folder}: no PNG or JPEG images")
+    info = _read_info(folder / "camera_info.yaml", frame)
+    infos = {names.colour_info: info}
+    if depth:
+        infos[names.depth_info] = _depth_info(folder, info, next(iter(depth.values())))
+    images = [
+        *((stamp_ns, names.colour + COMPRESSED, path) for stamp_ns, path in colour.items()),
+        *((stamp_ns, names.depth + COMPRESSED_DEPTH, path) for stamp_ns, path in depth.items()),
+    ]
+    images.sort()
+    first_ns, progress = images[0][0], Progress(0, len(images))
+    bag = BagWriter(bag_folder, overwrite=overwrite)
+    try:
+        for topic in infos:
+            bag.add_topic(topic, CAMERA_INFO, LATCHED)
+        for topic in dict.fromkeys(topic for _, topic, _ in images):
+            bag.add_topic(topic, COMPRESSED_IMAGE, IMAGES)
+        for topic, each in infos.items():
+            bag.write(topic, DepthInfo().encode((first_ns, each), BAG_WIRE), first_ns)
+        for number, (stamp_ns, topic, path) in enumerate(images):
+            data, form = _data(path), _SUFFIXES[path.suffix.lower()]
+            if topic.endswith(COMPRESSED):
+                cdr = CompressedColour.packed(data, stamp_ns, frame, form, BAG_WIRE)
+            else:
+                cdr = CompressedDepth().encode((stamp_ns, frame, _depth(path, data, depth_scale)), BAG_WIRE)
+            bag.write(topic, cdr, stamp_ns)
+            progress.at(number)
+    except BaseException:
+        bag.discard()
+        raise
+    bag.close()
+    progress.end()
+    seconds = (images[-1][0] - first_ns) / NANOSECONDS
+    return f"{bag_folder}: {len(colour)} colour and {len(depth)} depth images of {camera}, {seconds:.1f} s"
+
+
+def _stamped(folder: Path, rate: float) -> dict[int, Path]:
+    """The images of a folder by their stamps in nanoseconds, in order; empty where there is none."""
+    if not folder.is_dir():
+        return {}
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES and path.is_file())
+    found: dict[int, Path] = {}
+    for number, path in enumerate(paths):
+        stamp_ns = _stamp(path.stem)
+        stamp_ns = round((number + 1) / rate * NANOSECONDS) if stamp_ns is None else stamp_ns
+        if stamp_ns in found:
+            raise ImageFolderError(f"{path}: has the stamp of {found[stamp_ns].name}")
+        found[stamp_ns] = path
+    return dict(sorted(found.items()))
+
+
+def _stamp(stem: str) -> int | None:
+    """Nanoseconds of a name such as ``1305031102.175304``; None for one without a decimal point."""
+    if "." not in stem:
+        return None
+    try:
+        stamp_ns = int(Decimal(stem) * NANOSECONDS)
+    except (InvalidOperation, ValueError, OverflowError):
+        return None
+    return stamp_ns if 0 < stamp_ns <= MAX_STAMP_NS else None
+
+
+def _read_info(path: Path, frame: str) -> Camera:
+    try:
+        content = files.read_yaml(path, aliases=False)
+        model = str(content.get("distortion_model") or "plumb_bob")
+        given = _numbers(content, "distortion_coefficients") if "distortion_coefficients" in content else np.zeros(0)
+        distortion = np.zeros(MODELS.get(model, len(given)))
+        if len(given) > len(distortion):
+            raise ValueError(f"{len(given)} distortion coefficients of {model}")
+        distortion[: len(given)] = given
+        matrix = _numbers(content, "camera_matrix").reshape(3, 3)
+        size = int(content["image_width"]), int(content["image_height"])
+        return Camera(frame, *size, matrix, distortion, model)
+    except files.FileError as error:
+        raise ImageFolderError(f"{path}: {error}") from error
+    except KeyError as error:
+        raise ImageFolderError(f"{path}: {error.args[0]} is missing") from error
+    except (AttributeError, TypeError, ValueError, CameraError) as error:
+        raise ImageFolderError(f"{path}: {error}") from error
+
+
+def _numbers(content: Mapping[str, Any], key: str) -> Any:
+    return np.asarray(content[key]["data"], dtype=np.float64).ravel()
+
+
+def _depth_info(folder: Path, colour: Camera, first: Path) -> Camera:
+    """Intrinsics of the depth images: of a file, or those of the colour images at the size of the first one."""
+    path = folder / "depth_info.yaml"
+    if path.is_file():
+        return _read_info(path, colour.frame_id)
+    height, width = _decoded(first, _data(first)).shape
+    scale = np.array([width / colour.width, height / colour.height])
+    matrix = colour.matrix.copy()
+    matrix[[0, 1], [0, 1]] *= scale
+    # pixels count from the centre of the first one
+    matrix[:2, 2] = (matrix[:2, 2] + 0.5) * scale - 0.5
+    return replace(colour, width=width, height=height, matrix=matrix)
+
+
+def _data(path: Path) -> bytes:
+    try:
+        if path.stat().st_size > _LARGEST:
+            raise ImageFolderError(f"{path}: larger than {_LARGEST >> 20} MB")
+        return path.read_bytes()
+    except OSError as error:
+        raise ImageFolderError(f"{path}: {error}") from error
+
+
+def _decoded(path: Path, data: bytes) -> Any:
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 2:
+        raise ImageFolderError(f"{path}: no PNG image of 16 bits and one channel")
+    return pixels
+
+
+def _depth(path: Path, data: bytes, scale: float) -> Any:
+    """(height, width) millimetres, ``uint16``."""
+    pixels = _decoded(path, data)
+    if scale == _MILLIMETRES:
+        return pixels
+    return np.round(np.minimum(pixels * (_MILLIMETRES / scale), 65535.0)).astype(np.uint16)

@@ -1,0 +1,123 @@
+"""Folders of images as bags: what is in the files is in the bag, and bad files are named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from body_tracking import cli
+from body_tracking.camera.codecs import CompressedColour, CompressedDepth
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.message_types import COMPRESSED_IMAGE
+from body_tracking.mesh.codecs import DepthInfo
+from body_tracking.recording.image_folder import import_folder
+from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, deserialize
+
+STAMPS = ("1305031102.175304", "1305031102.211214", "1305031102.243211")
+
+
+def folder(path: Path, stamps: tuple[str, ...] = STAMPS, size: tuple[int, int] = (64, 48)) -> Path:
+    """Three images, with depth at half the size."""
+    (path / "rgb").mkdir(parents=True)
+    (path / "depth").mkdir()
+    width, height = size
+    for number, stamp in enumerate(stamps):
+        colour = np.full((height, width, 3), 60 * number + 20, np.uint8)
+        assert cv2.imwrite(str(path / "rgb" / f"{stamp}.png"), colour)
+        depth = np.full((height // 2, width // 2), 5000 + 500 * number, np.uint16)
+        assert cv2.imwrite(str(path / "depth" / f"{stamp}.png"), depth)
+    info = {
+        "image_width": width,
+        "image_height": height,
+        "camera_matrix": {"rows": 3, "cols": 3, "data": [50.0, 0.0, 31.5, 0.0, 50.0, 23.5, 0.0, 0.0, 1.0]},
+        "distortion_model": "plumb_bob",
+        "distortion_coefficients": {"rows": 1, "cols": 5, "data": [0.1, 0.0, 0.0, 0.0, 0.0]},
+    }
+    (path / "camera_info.yaml").write_text(yaml.safe_dump(info))
+    return path
+
+
+def test_images_stamps_and_intrinsics_are_in_the_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    images, bag = folder(tmp_path / "images"), tmp_path / "bag"
+    assert cli.main(["import", str(images), "-o", str(bag), "--sensor", "cam", "--depth-scale", "5000"]) == 0
+    assert "3 colour and 3 depth images of cam, 0.1 s" in capsys.readouterr().out
+    colour, depth, infos = {}, {}, {}
+    with BagReader(bag) as reader:
+        for raw in reader.messages():
+            if raw.topic == "/cam/color/image_raw/compressed":
+                stamp_ns, frame, pixels = CompressedColour().decode(raw.cdr, BAG_WIRE)
+                assert frame == "cam_optical_frame" and raw.log_time_ns == stamp_ns
+                colour[stamp_ns] = pixels
+                data = bytes(deserialize(COMPRESSED_IMAGE, raw.cdr).data)
+                assert data in {path.read_bytes() for path in (images / "rgb").iterdir()}
+            elif raw.topic == "/cam/depth/image_raw/compressedDepth":
+                stamp_ns, _, metres = CompressedDepth().decode(raw.cdr, BAG_WIRE)
+                depth[stamp_ns] = metres
+            else:
+                infos[raw.topic] = DepthInfo().decode(raw.cdr, BAG_WIRE)
+    assert list(colour) == list(depth) == [int(stamp.replace(".", "")) * 1000 for stamp in STAMPS]
+    assert [int(pixels[0, 0, 0]) for pixels in colour.values()] == [20, 80, 140]
+    assert [float(metres[0, 0]) for metres in depth.values()] == pytest.approx([1.0, 1.1, 1.2])
+    own, registered = infos["/cam/color/camera_info"], infos["/cam/depth/camera_info"]
+    assert own.distortion[0] == registered.distortion[0] == 0.1
+    # the same lines of sight through the pixels of either
+    np.testing.assert_allclose(own.rays(np.array([10.5, 20.5])), registered.rays(np.array([5.0, 10.0])), atol=1e-9)
+
+
+def test_files_without_stamps_come_at_the_rate(tmp_path: Path) -> None:
+    images = folder(tmp_path / "images", ("0001", "0002", "0010"))
+    import_folder(images, tmp_path / "bag", "camera1", 10.0, 1000.0)
+    with BagReader(tmp_path / "bag") as reader:
+        stamps = [raw.log_time_ns for raw in reader.messages(["/camera1/color/image_raw/compressed"])]
+    assert stamps == [100_000_000, 200_000_000, 300_000_000]
+
+
+def _no_info(images: Path) -> None:
+    (images / "camera_info.yaml").unlink()
+
+
+def _no_matrix(images: Path) -> None:
+    (images / "camera_info.yaml").write_text("image_width: 64\nimage_height: 48\n")
+
+
+def _uncalibrated(images: Path) -> None:
+    text = (images / "camera_info.yaml").read_text()
+    (images / "camera_info.yaml").write_text(text.replace("50.0", "0.0"))
+
+
+def _no_yaml(images: Path) -> None:
+    (images / "camera_info.yaml").write_text("[" * 1000)
+
+
+def _colour_as_depth(images: Path) -> None:
+    first = sorted((images / "depth").iterdir())[-1]
+    assert cv2.imwrite(str(first), np.zeros((4, 4, 3), np.uint8))
+
+
+def _nothing(images: Path) -> None:
+    for path in (images / "rgb").iterdir():
+        path.unlink()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (_no_info, "camera_info.yaml"),
+        (_no_matrix, "camera_matrix is missing"),
+        (_uncalibrated, "calibrated"),
+        (_no_yaml, "camera_info.yaml"),
+        (_colour_as_depth, "no PNG image of 16 bits"),
+        (_nothing, "no PNG or JPEG images"),
+    ],
+)
+def test_a_folder_that_cannot_be_used_is_named_and_leaves_no_bag(tmp_path: Path, spoil: object, reason: str) -> None:
+    images = folder(tmp_path / "images")
+    assert callable(spoil)
+    spoil(images)
+    with pytest.raises(BodyTrackingError, match=reason):
+        import_folder(images, tmp_path / "bag", "camera1", 30.0, 1000.0)
+    assert not (tmp_path / "bag").exists()
