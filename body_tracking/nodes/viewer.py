@@ -28,7 +28,7 @@ from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.parameters import Parameter
 from body_tracking.core.qos import LATCHED, LATEST, RELIABLE, Qos, request_for
 from body_tracking.core.sensor_poses import SensorPose
-from body_tracking.core.skeleton import FloatArray, Skeleton
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Skeleton
 from body_tracking.core.sources import check_sensor_name
 from body_tracking.filters import FILTERS
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS
@@ -71,7 +71,7 @@ PARAMETERS = (
 )
 
 _STALE_S = 1.0
-"""Age from which skeletons are drawn pale, seconds."""
+"""Age from which skeletons are drawn pale, and messages of views are not drawn, seconds."""
 _TOGETHER_S = 0.4
 """Time for which a person is shown after the last message with that person, seconds."""
 _ANSWER_S = 30.0
@@ -117,7 +117,7 @@ class ViewerNode(GraphNode):
             name: self.create_client(SetParametersAtomically, f"{name}/set_parameters_atomically")
             for name in ("skeleton_filter", "joint_angles")
         }
-        self.recent: dict[str, deque[tuple[bytes, float]]] = {}
+        self.recent: dict[str, deque[tuple[bytes, int]]] = {}
         self.viewed: dict[str, tuple[Qos, Any]] = {}
         """Subscriptions of the views' topics, and their profiles."""
         self.held: set[str] = set()
@@ -199,7 +199,7 @@ class ViewerNode(GraphNode):
 
     def on_recent(self, topic: str, cdr: bytes, sent_ns: int) -> None:
         self.monitor.totals["received"] += 1
-        self.recent[topic].append((cdr, time.monotonic()))
+        self.recent[topic].append((cdr, self.waiting_ns()))
 
     def on_pose(self, message: Any, sent_ns: int) -> None:
         pose = transform_to_pose(message)
@@ -247,12 +247,7 @@ class ViewerNode(GraphNode):
         """Draw the scene, and curves and status if they are due."""
         self.page.draw(self.snapshot())
         if self.views:
-            kept = dict(self.recent)  # the other thread changes it
-            fresh = {
-                topic: [cdr for cdr, received in list(each) if topic in self.held or now - received <= _STALE_S]
-                for topic, each in kept.items()
-            }
-            self.page.draw_views(fresh, self.decoded, dict(self.poses))
+            self.page.draw_views(self.fresh(), self.decoded, dict(self.poses))
         if now - self.plotted >= 1.0 / float(str(self.values["plot_rate"])):
             self.plotted = now
             self.collect_angles()
@@ -261,6 +256,18 @@ class ViewerNode(GraphNode):
             self.status_drawn = now
             self.page.draw_status(self.statuses, now)
             self.page.draw_bodies(self.bodies(), self.body)
+
+    def fresh(self) -> dict[str, list[bytes]]:
+        """The messages of the views' topics that are not old.
+
+        By the clock of timeouts: a mesh comes five times per second of a recording, every second of a slow playback.
+        """
+        now_ns, most_ns = self.waiting_ns(), _STALE_S * NANOSECONDS
+        kept = dict(self.recent)  # the other thread changes it
+        return {
+            topic: [cdr for cdr, at_ns in list(each) if topic in self.held or 0 <= now_ns - at_ns <= most_ns]
+            for topic, each in kept.items()
+        }
 
     def snapshot(self) -> Snapshot:
         """The content of the next drawing."""

@@ -1,9 +1,9 @@
-"""The viewer's drawing thread outlives a drawing that fails, and ends the node where all do."""
+"""The viewer's drawing thread outlives a drawing that fails, and ends the node where all do; what of views is drawn."""
 
 from __future__ import annotations
 
 import threading
-from collections import Counter
+from collections import Counter, deque
 from types import SimpleNamespace
 from typing import Any
 
@@ -61,3 +61,39 @@ def test_the_node_reports_repeated_failures_of_drawing_and_ends() -> None:
     assert drawing.tried == 10
     assert "drawing failed 10 times" in drawing.reported[-2] and "deque mutated" in drawing.reported[-2]
     assert drawing.reported[-1] == "ended"
+
+
+class Playback(SimpleNamespace):
+    """Views' messages of a recording that is played; one topic is latched."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            recent={"/mesh": deque(maxlen=16), "/camera_info": deque(maxlen=16)},
+            held={"/camera_info"},
+            monitor=SimpleNamespace(totals=Counter()),
+            clock_s=0.0,
+        )
+
+    def waiting_ns(self) -> int:
+        return round(1e9 * self.clock_s)
+
+    def play_to(self, clock_s: float, *topics: str) -> dict[str, list[bytes]]:
+        self.clock_s = clock_s
+        for topic in topics:
+            ViewerNode.on_recent(self, topic, f"{clock_s:g}".encode(), 0)  # type: ignore[arg-type]
+        return ViewerNode.fresh(self)  # type: ignore[arg-type]
+
+
+def test_messages_of_views_grow_old_by_the_clock_of_the_recording() -> None:
+    playback = Playback()
+    assert playback.play_to(10.0, "/mesh", "/camera_info")["/mesh"] == [b"10"]
+    # four times as slow: one mesh per 0.8 s of wall time, which is 0.2 s of the recording
+    assert playback.play_to(10.2, "/mesh")["/mesh"] == [b"10", b"10.2"]
+    assert playback.play_to(11.1)["/mesh"] == [b"10.2"]
+    assert playback.play_to(11.5) == {"/mesh": [], "/camera_info": [b"10"]}
+
+
+def test_messages_of_views_from_before_a_backward_jump_are_not_drawn() -> None:
+    playback = Playback()
+    playback.play_to(10.0, "/mesh")
+    assert playback.play_to(2.0, "/mesh")["/mesh"] == [b"2"]
