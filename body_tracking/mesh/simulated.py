@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, grey_dilation, grey_erosion, maximum_filter
-from scipy.special import ndtr
+from scipy.ndimage import gaussian_filter
+from scipy.special import ndtri
 
+from body_tracking.core.compiled import compiled
 from body_tracking.core.skeleton import BoolArray, FloatArray, SingleArray
 from body_tracking.mesh.depth import DepthCamera, axial_noise
 from body_tracking.mesh.person import Floor
@@ -87,44 +89,59 @@ def measured(
     true = depth.astype(np.float64)
     there = (true > 0.0) & (true < own.farthest)
     empty = np.where(there, true, own.farthest)
-    near, far = grey_erosion(empty, 3), grey_dilation(empty, 3)
+    block = np.ones((3, 3), np.uint8)
+    near, far = (np.asarray(of(empty, block)) for of in (cv2.erode, cv2.dilate))
     # a surface at 80 degrees falls away by 5.7 pixels for each pixel
     edge = far - near > np.maximum(own.jump, 2.0 * 5.7 / view.camera.matrix[0, 0] * near)
-    slope = np.where(edge, 0.0, _slopes(empty, view))
+    slope = np.where(edge, 0.0, _slopes(np.log(empty), view.rays, *np.diagonal(view.camera.matrix)[:2]))
     sigma = own.noise * axial_noise(true) * (1.0 + own.grazing * slope) * np.where(dark, own.dark, 1.0)
     seen = true + own.dark_bias * dark + sigma * rng.standard_normal(shape)
     if floor is not None:
-        points = np.concatenate([view.rays, np.ones_like(view.rays[..., :1])], axis=-1) * true[..., None]
-        above = np.maximum(points @ floor.up + floor.height, 0.0)
+        above = np.maximum(true * (view.rays @ floor.up[:2] + floor.up[2]) + floor.height, 0.0)
         # the floor itself is lit by nothing but the lamp; its neighbours are lit by it
         seen += own.multipath * np.exp(-above / own.multipath_height) * (above > 0.02)
     flies = edge & there & (rng.random(shape) < own.flying) & (far < own.farthest)
     seen = np.where(flies, near + rng.random(shape) * (far - near), seen)
-    # holes come in patches of pixels whose light is too weak together
+    # holes come in patches of pixels whose light is too weak together; these have a standard normal distribution
     patches = gaussian_filter(rng.standard_normal(shape), 1.0)
-    level = ndtr(patches / patches.std())
-    missing = maximum_filter(edge, 3) & (level < own.outline_holes)
-    missing |= dark & (level > 1.0 - own.dark_holes)
-    rows, columns = np.indices(shape)
-    outwards = np.hypot((columns / (shape[1] - 1) - 0.5) * 2.0, (rows / (shape[0] - 1) - 0.5) * 2.0)
-    missing |= level > 1.0 - own.corner_holes * np.clip((outwards - own.lit) / 0.35, 0.0, 1.0)
+    patches /= patches.std()
+    missing = (cv2.dilate(edge.astype(np.uint8), block) > 0) & (patches < ndtri(own.outline_holes))
+    missing |= dark & (patches > ndtri(1.0 - own.dark_holes))
+    across, down = (np.square(np.linspace(-1.0, 1.0, count)) for count in reversed(shape))
+    weak = np.clip((np.sqrt(down[:, None] + across) - own.lit) / 0.35, 0.0, 1.0)
+    corners = np.nonzero(weak)
+    missing[corners] |= patches[corners] > ndtri(1.0 - own.corner_holes * weak[corners])
     # beyond 85 degrees hardly any light returns
     missing |= slope > 11.0
     seen = np.where(there & ~missing, seen, 0.0)
     return np.round(np.clip(seen / own.step, 0.0, 65535.0)).astype(np.uint16)
 
 
-def _slopes(depth: FloatArray, view: DepthCamera) -> FloatArray:
+@compiled
+def _slopes(logs: FloatArray, rays: SingleArray, fx: float, fy: float) -> FloatArray:
     """(height, width) tangent of the angle between a surface's normal and the ray, by the image gradient of ln z.
 
     With z(x, y) over image coordinates x = X/Z, y = Y/Z the normal is along (-dz/dx, -dz/dy, z + x dz/dx + y dz/dy).
+
+    Args:
+        logs: (height, width) of the distances.
+        rays: (height, width, 2) x and y; the slope is that of a surface that faces the camera where they are NaN.
+        fx: focal length, pixels, with ``fy``.
+        fy: see ``fx``.
     """
-    focal = view.camera.matrix[[0, 1], [0, 1]]
-    down, across = np.gradient(np.log(depth))
-    gx, gy = across * focal[0], down * focal[1]
-    x, y = view.rays[..., 0].astype(np.float64), view.rays[..., 1].astype(np.float64)
-    normals = np.stack([-gx, -gy, 1.0 + x * gx + y * gy], axis=-1)
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1)
-    cosine = np.abs((normals * rays).sum(-1)) / np.linalg.norm(normals, axis=-1) / np.linalg.norm(rays, axis=-1)
-    cosine = np.clip(np.nan_to_num(cosine, nan=1.0), 1e-3, 1.0)
-    return np.asarray(np.sqrt(1.0 - cosine**2) / cosine)
+    rows, columns = logs.shape
+    found = np.zeros((rows, columns))
+    for i in range(rows):
+        above, below = max(i - 1, 0), min(i + 1, rows - 1)
+        for j in range(columns):
+            left, right = max(j - 1, 0), min(j + 1, columns - 1)
+            x, y = float(rays[i, j, 0]), float(rays[i, j, 1])
+            gx = fx * (logs[i, right] - logs[i, left]) / (right - left)
+            gy = fy * (logs[below, j] - logs[above, j]) / (below - above)
+            forward = 1.0 + x * gx + y * gy
+            # the normal times the ray is 1
+            cosine = 1.0 / np.sqrt((gx * gx + gy * gy + forward * forward) * (x * x + y * y + 1.0))
+            if cosine == cosine:
+                cosine = min(max(cosine, 1e-3), 1.0)
+                found[i, j] = np.sqrt(1.0 - cosine * cosine) / cosine
+    return found
