@@ -307,6 +307,24 @@ def find_pulls(
 
 
 @compiled
+def behind_others(
+    vertices: FloatArray, pixels: FloatArray, depth: SingleArray, mask: BoolArray, margin: float
+) -> FloatArray:
+    """(N,) 1 for vertices behind a surface that is not the person's, 0 for others; arguments as of
+    :func:`find_pulls`.
+    """
+    height, width = depth.shape
+    found = np.zeros(len(vertices))
+    for v in range(len(vertices)):
+        if not (pixels[v, 0] > -0.5 and pixels[v, 1] > -0.5):
+            continue
+        column, row = int(pixels[v, 0] + 0.5), int(pixels[v, 1] + 0.5)
+        if column < width and row < height and not mask[row, column]:
+            found[v] = 0.0 < depth[row, column] < vertices[v, 2] - margin
+    return found
+
+
+@compiled
 def accumulate(
     arms: FloatArray,
     frames: FloatArray,

@@ -27,6 +27,12 @@ WIDE: Final = (0.2, 0.2, 0.2, 0.06, 0.06, 0.03, 0.03)
 """Metres: the same from a rough start."""
 MATCHED: Final = 0.06
 """Metres within which a measured point belongs to the body: clothes, shape and a few times the noise."""
+AGAIN: Final = 0.03
+"""Share of the information of ordinary postures that counts for a hidden limb beside a prediction, which has that of
+all images before in it: counted in full again 30 times a second, they lifted a hidden elbow by 100 mm in half a second.
+A limb that is seen elsewhere than expected needs them in full: they bring it back from behind the trunk."""
+_HIDDEN: Final = 0.35
+"""Share of a limb's vertices behind something else from which on the limb is hidden: of an arm, forearm and hand."""
 FACING_CAMERA: Final[FloatArray] = np.diag([1.0, -1.0, -1.0])
 """Orientation of a model whose person stands upright and looks into the camera."""
 
@@ -65,11 +71,13 @@ class Prediction:
         pose: the expected one.
         shift: metres, standard deviation of the first joint's place along each axis.
         turns: (J, 3) radians, standard deviations about the axes of the segments' frames.
+        hidden: (J,) joints of limbs that something else than the person hides; none without.
     """
 
     pose: Pose
     shift: float
     turns: FloatArray
+    hidden: BoolArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,6 +164,9 @@ class MeshFitter:
         self.ancestors: BoolArray = np.eye(joints, dtype=np.bool_)
         for joint in range(1, joints):
             self.ancestors[joint] |= self.ancestors[model.parents[joint]]
+        strongest = model.bones[np.arange(len(model.vertices)), model.weights.argmax(axis=1)]
+        below = self.ancestors[strongest].astype(np.float64)
+        self._below = below / np.maximum(below.sum(axis=0), 1.0)
         self._arms = [
             model.index(f"{side}_{joint}") for side in SIDES for joint in ("collar", "shoulder", "elbow", "wrist")
         ]
@@ -182,6 +193,18 @@ class MeshFitter:
         rotations = pose.rotations.copy()
         rotations[self._arms] = self.neutral(np.zeros(3), 0.1, 0.3).rotations[self._arms]
         return Pose(rotations, pose.translation)
+
+    def hidden(self, observation: Observation, vertices: FloatArray) -> BoolArray:
+        """(J,) joints a good part of whose limb lies behind something else than the person.
+
+        Args:
+            observation: of the person.
+            vertices: (N, 3) where the body is expected.
+        """
+        behind = energy.behind_others(
+            vertices, observation.camera.project(vertices), observation.depth, observation.mask, energy.MARGIN
+        )
+        return np.asarray(behind @ self._below > _HIDDEN)
 
     def search(self, observation: Observation, orientations: Sequence[Orientation] = ()) -> Fit:
         """The best fit from several starts of a person who stands somewhere in view.
@@ -300,7 +323,7 @@ class MeshFitter:
             )
             system.add(arms, pulls.directions, pulls.residuals, each * robust)
             total += float((each * cost).sum())
-        total += self._add_angles(system, pose)
+        total += self._add_angles(system, pose, None if prediction is None else prediction.hidden)
         if prediction is not None:
             total += self._add_prediction(system, pose, prediction)
         for orientation in orientations:
@@ -319,13 +342,15 @@ class MeshFitter:
         )
         return Evaluation(fit, system.gradient)
 
-    def _add_angles(self, system: _System, pose: Pose) -> float:
-        """Limits (Jatesiktat 2018, eq. 8) and ordinary postures."""
+    def _add_angles(self, system: _System, pose: Pose, hidden: BoolArray | None) -> float:
+        """Limits (Jatesiktat 2018, eq. 8) and ordinary postures, which count less for ``hidden`` joints (J,)."""
         anatomy = self.anatomy
         angles = anatomy.angles(pose.rotations)
         excess = np.maximum(angles.values - anatomy.high, 0.0) + np.minimum(angles.values - anatomy.low, 0.0)
         limit = np.where(excess != 0.0, self.settings.limit**-2.0, 0.0)
         posture = anatomy.stddev**-2.0
+        if hidden is not None:
+            posture = np.where(hidden[:, None], AGAIN * posture, posture)
         off = angles.values - anatomy.mean
         pull = np.where(excess != 0.0, limit * excess, 0.0) + posture * off
         system.add_turns(angles.gradients, limit + posture, pull)

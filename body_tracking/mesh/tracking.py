@@ -207,7 +207,7 @@ class MeshTracker:
         """The best fit that is at hand; None where it is not yet time to search again."""
         points = None if skeleton is None else self._points_of(skeleton)
         if self._fits:
-            prediction = self._predicted(stamp_ns)
+            prediction = self._predicted(stamp_ns, seen)
             fit = self._fitter.fit(seen, prediction.pose, prediction, orientations)
             if not fit.lost:
                 return self._with_arms(stamp_ns, seen, orientations, fit)
@@ -237,7 +237,7 @@ class MeshTracker:
         here = self._fitter.evaluate(seen, fit.pose, SCALES[-1], None, orientations).fit
         return again if not again.lost and again.energy < here.energy else fit
 
-    def _predicted(self, stamp_ns: int) -> Prediction:
+    def _predicted(self, stamp_ns: int, seen: Observation) -> Prediction:
         """The last pose, moved on by its last change where that is known."""
         last_ns, last = self._fits[-1]
         elapsed = max((stamp_ns - last_ns) / NANOSECONDS, 1e-3)
@@ -250,7 +250,8 @@ class MeshTracker:
                 turns = so3.rotation_vectors(before.pose.rotations.mT @ pose.rotations)
                 rotations = pose.rotations @ so3.quat_to_matrix(so3.exp(share * turns))
                 pose = Pose(rotations, pose.translation + share * (pose.translation - before.pose.translation))
-        return Prediction(pose, 0.01 + _SHIFT_RATE * elapsed, 0.05 + self._rates * elapsed)
+        hidden = self._fitter.hidden(seen, last.posed.vertices)
+        return Prediction(pose, 0.01 + _SHIFT_RATE * elapsed, 0.05 + self._rates * elapsed, hidden)
 
     def _points_of(self, skeleton: Skeleton) -> JointPoints | None:
         """The joints that body model and skeleton share."""

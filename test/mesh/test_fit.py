@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -98,6 +99,36 @@ def test_ordinary_postures_are_within_the_ranges(fitter: MeshFitter) -> None:
     anatomy = fitter.anatomy
     assert np.all(anatomy.low < anatomy.high)
     assert np.all((anatomy.mean[1:] >= anatomy.low[1:]) & (anatomy.mean[1:] <= anatomy.high[1:]))
+
+
+# --- hidden limbs
+
+
+def test_a_limb_is_hidden_where_most_of_it_is_behind_something_else(camera: DepthCamera, fitter: MeshFitter) -> None:
+    pose = fitter.neutral(PLACE, 1.3, 0.2)
+    observation = seen(camera, fitter, pose, np.random.default_rng(4))
+    posed = fitter.body.posed(pose)
+    assert not fitter.hidden(observation, posed.vertices).any()
+    # a board before all that is farther to the right in the image than the left elbow
+    column = round(float(CAMERA.project(posed.placed)[fitter.body.model.index("left_elbow"), 0]))
+    depth, mask = observation.depth.copy(), observation.mask.copy()
+    depth[:, column:], mask[:, column:] = 1.0, False
+    hidden = fitter.hidden(replace(observation, depth=depth, mask=mask), posed.vertices)
+    names = {name for name, is_hidden in zip(fitter.body.model.joint_names, hidden, strict=True) if is_hidden}
+    assert {"left_elbow", "left_wrist"} <= names <= {"left_collar", "left_shoulder", "left_elbow", "left_wrist"}
+
+
+def test_a_hidden_arm_stays_where_it_is_expected_for_half_a_second(fitter: MeshFitter) -> None:
+    raised, elbows = fitter.neutral(PLACE, 1.5, 1.5), ("left_elbow", "right_elbow")
+    moved = []
+    for hidden in (np.ones(len(fitter.body.joints), np.bool_), None):
+        pose = raised
+        for _ in range(15):
+            turns = np.full((len(fitter.body.joints), 3), 0.3)
+            pose = fitter.fit(nothing(), pose, solver.Prediction(pose, 0.04, turns, hidden)).pose
+        moved.append(off(fitter, raised, pose, elbows))
+    # ordinary postures pull it down in time
+    assert moved[0] < 0.06 and moved[1] > 2.0 * moved[0]
 
 
 # --- terms
