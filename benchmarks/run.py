@@ -64,6 +64,8 @@ BENCHMARKS = {
     "depth_images": Benchmark(1, MAKEHUMAN),
     "camera_skeleton": Benchmark(10, MAKEHUMAN),
     "mesh_fit": Benchmark(10, MAKEHUMAN),
+    "mesh_hidden": Benchmark(8, MAKEHUMAN),
+    "mesh_hard": Benchmark(20, MAKEHUMAN),
     "mesh_real": Benchmark(1, recordings("depth_turn")),
     "imu_pendulum": Benchmark(1, IMU),
     "imu_recordings": Benchmark(1, IMU),

@@ -31,6 +31,14 @@ AGAIN: Final = 0.03
 """Share of the information of ordinary postures that counts for a hidden limb beside a prediction, which has that of
 all images before in it: counted in full again 30 times a second, they lifted a hidden elbow by 100 mm in half a second.
 A limb that is seen elsewhere than expected needs them in full: they bring it back from behind the trunk."""
+_HAND: Final = 0.1
+"""Metres from a wrist to the middle of the hand, and what an elbow's surface may be off by."""
+_LOOSE: Final = 8
+"""Least points that may be a hand."""
+_REACHED: Final = 0.05
+"""Metres: standard deviation of a hand's place at such points."""
+_REACHING: Final = (0.2, 0.1, 0.06)
+"""Metres: robust scales of the steps towards them."""
 _HIDDEN: Final = 0.35
 """Share of a limb's vertices behind something else from which on the limb is hidden: of an arm, forearm and hand."""
 FACING_CAMERA: Final[FloatArray] = np.diag([1.0, -1.0, -1.0])
@@ -193,6 +201,62 @@ class MeshFitter:
         rotations = pose.rotations.copy()
         rotations[self._arms] = self.neutral(np.zeros(3), 0.1, 0.3).rotations[self._arms]
         return Pose(rotations, pose.translation)
+
+    def unmatched(self, observation: Observation, fit: Fit) -> dict[str, FloatArray]:
+        """By side, the points (n, 3) within an arm's reach that do not belong to the body in a fit, metres.
+
+        A side with too few for a hand is left out.
+        """
+        offsets = fit.matches.places - observation.points
+        loose = observation.points[(offsets * offsets).sum(axis=1) > MATCHED**2]
+        found = {}
+        for side in SIDES:
+            shoulder, elbow, wrist = self._arm(side)
+            reach = np.linalg.norm(np.diff(self.body.joints[[shoulder, elbow, wrist]], axis=0), axis=1).sum() + _HAND
+            near = loose[np.linalg.norm(loose - fit.posed.placed[shoulder], axis=1) < reach]
+            if len(near) >= _LOOSE:
+                found[side] = near
+        return found
+
+    def towards_unmatched(self, observation: Observation, fit: Fit) -> list[Pose]:
+        """Poses with one hand at points that do not belong to the body in a fit; none where there are too few."""
+        found = []
+        for side, near in self.unmatched(observation, fit).items():
+            shoulder, _, wrist = self._arm(side)
+            away = np.linalg.norm(near - fit.posed.placed[shoulder], axis=1)
+            hand = near[away >= np.percentile(away, 80.0)].mean(axis=0)
+            targets = JointPoints(np.array([wrist]), hand[None], _REACHED)
+            start = self.reaching(fit.pose, side, hand)
+            found.append(self.fit(observation, start, joints=targets, scales=_REACHING).pose)
+        return found
+
+    def reaching(self, pose: Pose, side: str, place: FloatArray) -> Pose:
+        """A pose with a wrist at a place (3,) in the camera's frame, or as near as the arm reaches.
+
+        The elbow bends as far as the distance asks for; the shoulder takes the least turn.
+        """
+        body, (shoulder, elbow, wrist) = self.body, self._arm(side)
+        upper, fore = np.linalg.norm(np.diff(body.joints[[shoulder, elbow, wrist]], axis=0), axis=1)
+        centre = body.posed(pose).placed[shoulder]
+        distance = float(np.clip(np.linalg.norm(place - centre), abs(upper - fore) + 0.02, upper + fore - 0.005))
+        # law of cosines; 0 is a straight elbow
+        flexion = np.pi - np.arccos((upper**2 + fore**2 - distance**2) / (2.0 * upper * fore))
+        turned = np.tile(np.eye(3), (len(body.joints), 1, 1))
+        turned[elbow] = so3.quat_to_matrix(so3.exp(np.array([0.0, -flexion, 0.0])))
+        rotations = pose.rotations.copy()
+        rotations[elbow] = self.anatomy.rotations(turned)[elbow]
+        bent = body.posed(Pose(rotations, pose.translation))
+        one, other = bent.placed[wrist] - centre, place - centre
+        axis = np.cross(one, other)
+        size = float(np.linalg.norm(axis))
+        least = so3.quat_to_matrix(so3.exp(np.arctan2(size, one @ other) / max(size, 1e-9) * axis))
+        parent = bent.turned[body.model.parents[shoulder]]
+        rotations[shoulder] = parent.T @ least @ bent.turned[shoulder]
+        return Pose(rotations, pose.translation)
+
+    def _arm(self, side: str) -> tuple[int, int, int]:
+        shoulder, elbow, wrist = (self.body.model.index(f"{side}_{joint}") for joint in ("shoulder", "elbow", "wrist"))
+        return shoulder, elbow, wrist
 
     def hidden(self, observation: Observation, vertices: FloatArray) -> BoolArray:
         """(J,) joints a good part of whose limb lies behind something else than the person.

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from body_tracking.core import so3
 from body_tracking.core.camera import Camera
 from body_tracking.core.parameters import number_field
-from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, SingleArray, Skeleton, TrackingState
+from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, Joint, SingleArray, Skeleton, TrackingState
 from body_tracking.mesh.body_index import of_body_index
 from body_tracking.mesh.body_model import Body, Pose, load
 from body_tracking.mesh.depth import JUMP, LEAST, DepthCamera, supported
@@ -44,6 +44,14 @@ _SKELETON: Final = 0.08
 """Metres: standard deviation of the joints of another sensor's skeleton as a start."""
 _WHOLE: Final = 0.99
 """Share of points that belong to the body below which an arm may be elsewhere than fitted."""
+_EXPLAINED: Final = 0.97
+"""Share of points that belong to the body below which a hand may be where points are that do not."""
+_ELSEWHERE: Final = 0.15
+"""Metres: standard deviation per axis that the joints of such an arm have in addition."""
+_LIMBS: Final = {
+    side: [Joint[f"{name}_{side.upper()}"] for name in ("ELBOW", "WRIST", "HAND", "HAND_TIP", "THUMB")]
+    for side in ("left", "right")
+}
 _SEEN: Final = 0.05
 """Metres: standard deviation per axis up to which a joint counts as tracked; others are inferred."""
 
@@ -191,6 +199,10 @@ class MeshTracker:
         self._lost_ns = None
         self._fits = [*self._fits[-1:], (stamp_ns, fit)]
         result = placed(self._fitter, fit, self.observation, self._landmarks, self._shape_covariance)
+        elsewhere = self._fitter.unmatched(self.observation, fit) if fit.matched < _EXPLAINED else ()
+        for side in elsewhere:
+            self.counters["arms that may be elsewhere"] += 1
+            result.covariance[_LIMBS[side]] += _ELSEWHERE**2 * np.eye(3)
         return Tracked(stamp_ns, fit, result.points, result.covariance)
 
     def _indexed(self, index: NDArray[np.uint8], depth: SingleArray, expected: Fit | None) -> BoolArray:
@@ -226,14 +238,24 @@ class MeshTracker:
         return fit
 
     def _with_arms(self, stamp_ns: int, seen: Observation, orientations: Sequence[Orientation], fit: Fit) -> Fit:
-        """A fit, or a better one from hanging arms: the trunk's surface holds an arm that it hid for some images."""
+        """A fit, or a better one with the arms elsewhere.
+
+        The trunk's surface holds an arm that it hid for some images: a start with hanging arms. A hand that was faster
+        than expected leaves points of the person unexplained: starts with a hand there.
+        """
         waiting = self.parameters.search_every * NANOSECONDS
         waits = self._arms_ns is not None and 0 <= stamp_ns - self._arms_ns < waiting
-        if fit.matched >= _WHOLE or waits:
+        starts = [] if fit.matched >= _EXPLAINED else self._fitter.towards_unmatched(seen, fit)
+        if starts:
+            self.counters["starts with a hand elsewhere"] += 1
+        if fit.matched < _WHOLE and not waits:
+            self._arms_ns = stamp_ns
+            self.counters["starts with hanging arms"] += 1
+            starts = [*starts, self._fitter.with_hanging_arms(fit.pose)]
+        if not starts:
             return fit
-        self._arms_ns = stamp_ns
-        self.counters["starts with hanging arms"] += 1
-        again = self._fitter.fit(seen, self._fitter.with_hanging_arms(fit.pose), None, orientations)
+        fits = [self._fitter.fit(seen, start, None, orientations) for start in starts]
+        again = min(fits, key=lambda each: (each.lost, each.energy))
         here = self._fitter.evaluate(seen, fit.pose, SCALES[-1], None, orientations).fit
         return again if not again.lost and again.energy < here.energy else fit
 

