@@ -171,7 +171,7 @@ def run(job: Job) -> HiddenRun:
             }
     persons = {stamp: frame.person for stamp, frame in zip(truth, frames, strict=True)}
     body, view = stage.sensors[SENSOR].body, DepthCamera(scene.camera)
-    turned = _at(orientations, pose, [stamp for stamp, _ in chosen[::_FLOOR]], body.model.joint_names)
+    turned = orientations_at(orientations, pose, [stamp for stamp, _ in chosen[::_FLOOR]], body.model.joint_names)
     tracks["floor"] = {}
     for stamp, side in chosen[::_FLOOR]:
         mask = persons[stamp] & (images[stamp] > _nearer(truth[stamp], side) + 0.1)
@@ -195,7 +195,7 @@ def run(job: Job) -> HiddenRun:
     return result
 
 
-def _at(
+def orientations_at(
     measured: Sequence[SegmentOrientation], pose: SensorPose, stamps: Sequence[int], names: Sequence[str]
 ) -> dict[int, list[Orientation]]:
     """The orientations at the times of images as the mesh takes them."""

@@ -87,7 +87,9 @@ class BodyModel:
         return self.joint_names.index(joint)
 
     def reduced(self, vertices: int) -> BodyModel:
-        """The same model with about this many vertices, those of the original; itself if it has no more."""
+        """The same model with about this many vertices, those of the original (Jatesiktat 2018, figure 1 and section
+        II-B); itself if it has no more.
+        """
         if vertices >= len(self.vertices):
             return self
         faces = decimate(self.vertices, self.faces, vertices)
