@@ -7,6 +7,8 @@ What the paper leaves open is read as follows. Eq. 6 and 7 are in pixels, eq. 8 
 37 degrees of freedom with the body model of 20 joints, 40 in the paper; the limits are those of ``kinematics.ranges``.
 A success divides the damping by 10, a failure multiplies it by 10. Each candidate set has 250 points. Pixels are chosen
 by six parts of the body, half of them near the outline. The body's shape is given.
+
+Over 500 lines: one paper's method, whose terms share what is looked up of an image.
 """
 
 from __future__ import annotations
