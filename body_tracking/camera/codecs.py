@@ -63,7 +63,7 @@ class CompressedColour(Codec):
     def decode(self, cdr: bytes, wire: Wire) -> Colour:
         message = wire.deserialize(COMPRESSED_IMAGE, cdr)
         pixels = _decoded(memoryview(message.data), cv2.IMREAD_COLOR, str(message.format))
-        return _stamp_and_frame(message) + (np.ascontiguousarray(pixels[..., ::-1]),)
+        return _stamp_and_frame(message) + (np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), np.uint8),)
 
     def stamp_ns(self, payload: Colour) -> int:
         return payload[0]

@@ -52,8 +52,15 @@ def to_rgb(message: Any) -> tuple[int, str, NDArray[np.uint8]]:
         raise MessageError(f"encoding {encoding!r}, expected one of {', '.join((*_COLOURS, *_GREY))}")
     rows = _rows(message, channels)
     pixels = rows.reshape(len(rows), -1, channels)
-    order = [0, 0, 0] if channels == 1 else [2, 1, 0] if encoding.startswith("bgr") else [0, 1, 2]
-    return to_nanoseconds(message.header.stamp), str(message.header.frame_id), np.ascontiguousarray(pixels[..., order])
+    if channels == 3 and encoding.startswith("rgb"):
+        colours = np.ascontiguousarray(pixels)
+    else:
+        # channel by channel: indexing with a list of them takes five times as long
+        order = (0, 0, 0) if channels == 1 else (2, 1, 0) if encoding.startswith("bgr") else (0, 1, 2)
+        colours = np.empty((*pixels.shape[:2], 3), np.uint8)
+        for k, channel in enumerate(order):
+            colours[..., k] = pixels[..., channel]
+    return to_nanoseconds(message.header.stamp), str(message.header.frame_id), colours
 
 
 def _rows(message: Any, pixel_bytes: int) -> NDArray[np.uint8]:
