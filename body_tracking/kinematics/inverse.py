@@ -28,7 +28,7 @@ _J = Joint
 _TINY = 1e-9
 _STRAIGHT = 0.15
 """Sine of the elbow's flexion below which the forearm does not determine the upper arm's rotation about itself."""
-_LIMIT_STDDEV = np.radians(4.0)
+LIMIT_STDDEV = np.radians(4.0)
 """Standard deviation of the soft limits of the ranges of motion."""
 _TURNED = np.radians(60.0)
 """Rotation of a hand about itself from which two fits are different minima, which are half a turn apart."""
@@ -39,7 +39,7 @@ _TURNS = np.radians(np.arange(0.0, 360.0, 45.0))
 _PRONATIONS = 13
 """Steps of 15 degrees move a thumb's point by 7 mm, less than the distance between minima."""
 _TWIST_STDDEV = np.radians(TWIST_SHARING_STDDEV)
-_HUBER = 2.5
+HUBER = 2.5
 """Standard deviations beyond which a point's residual counts linearly (Huber 1964)."""
 
 
@@ -275,10 +275,10 @@ class InverseKinematics:
 
     def _costs(self, size: FloatArray, soft: FloatArray, tilt: FloatArray) -> FloatArray:
         """(...,) of normalised residuals (..., 19), the quantities (..., 26) of ranges and the tilt (..., 2)."""
-        points = np.where(size <= _HUBER, 0.5 * size**2, _HUBER * (size - 0.5 * _HUBER)).sum(axis=-1)
+        points = np.where(size <= HUBER, 0.5 * size**2, HUBER * (size - 0.5 * HUBER)).sum(axis=-1)
         off = (soft - self.prior.mean) / self.prior.stddev
         leans = tilt / self.prior.tilt_stddev
-        over = self.ranges.excess_of(soft) / _LIMIT_STDDEV
+        over = self.ranges.excess_of(soft) / LIMIT_STDDEV
         twist = soft @ self.ranges.twist / _TWIST_STDDEV
         result: FloatArray = points + 0.5 * ((off**2 + over**2).sum(axis=-1) + (leans**2).sum(axis=-1) + twist**2)
         return result
@@ -290,7 +290,7 @@ class InverseKinematics:
         lines = self.model.linearise(q, lengths)
         residual = (target - lines.posture.positions) * weights[:, None]
         size = _sizes(residual)
-        bounded = np.minimum(1.0, _HUBER / np.maximum(size, _TINY))
+        bounded = np.minimum(1.0, HUBER / np.maximum(size, _TINY))
         jacobian = (lines.jacobian * (weights * np.sqrt(bounded))[:, None, None]).reshape(-1, self.model.nv)
         error = (residual * np.sqrt(bounded)[:, None]).reshape(-1)
         normal = jacobian.T @ jacobian
@@ -300,7 +300,7 @@ class InverseKinematics:
         off = soft.values - self.prior.mean
         over = self.ranges.excess_of(soft.values)
         prior = 1.0 / self.prior.stddev**2
-        limit = np.where(over != 0.0, 1.0 / _LIMIT_STDDEV**2, 0.0)
+        limit = np.where(over != 0.0, 1.0 / LIMIT_STDDEV**2, 0.0)
         inner = soft.gradients.T @ ((prior + limit)[:, None] * soft.gradients)
         normal[6:, 6:] += inner
         gradient[6:] -= soft.gradients.T @ (prior * off + limit * over)

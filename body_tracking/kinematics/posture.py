@@ -61,21 +61,6 @@ class Tilt:
     gradients: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Rows:
-    """The prior's residuals at one configuration: 26 coordinates, the sharing of the axial twist, the pelvis's tilt.
-
-    Attributes:
-        coordinates: (26,) radians, of ``SoftCoordinates``.
-        residuals: (29,) differences from the prior's means.
-        gradients: (29, 32) by the tangent.
-    """
-
-    coordinates: FloatArray
-    residuals: FloatArray
-    gradients: FloatArray
-
-
 class PosturePrior:
     """Mean and standard deviation of each coordinate of ``upper_body`` after the base.
 
@@ -94,22 +79,6 @@ class PosturePrior:
         self.mean: FloatArray = np.where(self.postural, 0.0, ranges.centre)
         self.stddev: FloatArray = np.where(self.postural, postural, ranges.stddev)
         self.tilt_stddev: FloatArray = np.radians(TILT_STDDEV)
-        self._ranges = ranges
-
-    def rows(self, q: FloatArray, lines: Linearisation) -> Rows:
-        """Deviations from the prior's mean at one configuration, with their derivatives.
-
-        Args:
-            q: (35,) configuration.
-            lines: of the model there.
-        """
-        soft, tilt = self._ranges.soft_coordinates(q), self.tilt(lines)
-        gradients = np.zeros((len(self.mean) + 3, tilt.gradients.shape[1]))
-        gradients[:-3, 6:] = soft.gradients
-        gradients[-3, 6:] = self._ranges.twist @ soft.gradients
-        gradients[-2:] = tilt.gradients
-        twist = [self._ranges.twist @ soft.values]
-        return Rows(soft.values, np.concatenate([soft.values - self.mean, twist, tilt.values]), gradients)
 
     @staticmethod
     def tilt_of(rotation: FloatArray) -> FloatArray:

@@ -132,10 +132,6 @@ class Ranges:
             so3.exp(np.array([0.5 * np.pi * np.cross(hanging, reach) for reach in _REACH.values()]))
         )
 
-        self._centre = so3.quat_inverse(self.to_centre)
-        self._scalar_middle = self.centre[self._scalar_soft]
-        self._scalar_reach = 0.5 * (self.high - self.low)[self._scalar_soft]
-
     def soft_coordinates(self, q: FloatArray) -> SoftCoordinates:
         """The bounded quantities of configurations (..., nq)."""
         values = self.values(q)
@@ -164,17 +160,6 @@ class Ranges:
         The swing of a shoulder is bounded as a whole: its two components share the excess in their proportion.
         """
         return self.excess_of(self.values(q))
-
-    def certainly_within(self, q: FloatArray, margin: float) -> bool:
-        """Sufficient condition that a configuration (nq,) leaves no range by more than a margin, radians."""
-        angles = q[self._model.scalar_q]
-        outside = np.abs(angles - self._scalar_middle) > self._scalar_reach + margin
-        if outside.any():
-            return False
-        # A shoulder turned from the centre of its reach by less than any bound as a whole, is so about each axis: the
-        # scalar part of its rotation is the cosine of half the angle.
-        halves = np.abs((q[self._quaternions] * self._centre).sum(axis=1))
-        return bool(halves.min() > np.cos(0.5 * (np.radians(min(SHOULDER_SWING, SHOULDER_TWIST)) + margin)))
 
     def excess_of(self, values: FloatArray) -> FloatArray:
         """The same of the values (..., 26) of :class:`SoftCoordinates`."""

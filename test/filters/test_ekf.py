@@ -26,9 +26,10 @@ from body_tracking.core.skeleton import (
 )
 from body_tracking.filters.ekf.filter import ExtendedKalmanFilter
 from body_tracking.filters.ekf.parameters import EkfParameters
+from body_tracking.kinematics.compiled_posture import prior_rows, prior_table
 from body_tracking.kinematics.conventions import angles_of
 from body_tracking.kinematics.posture import PosturePrior
-from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV, Ranges
+from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UNOBSERVED
 from body_tracking.simulation.random_people import (
     ARMS,
@@ -727,10 +728,12 @@ def posture_stddev(q: FloatArray, lengths: FloatArray) -> tuple[FloatArray, Floa
 
     First where it counts twice and all points are known exactly, then by the prior alone.
     """
-    prior, lines = PosturePrior(MODEL, Ranges(MODEL)), MODEL.linearise(q, lengths)
+    ranges, lines = Ranges(MODEL), MODEL.linearise(q, lengths)
+    prior = PosturePrior(MODEL, ranges)
+    table = prior_table(MODEL, ranges, prior)
+    _, _, rows = prior_rows(q, lines.posture.rotations[0], lines.rotation_jacobian[0], table)
     used = np.append(prior.postural, [True] * 3)
-    stddev = np.concatenate([prior.stddev, [np.radians(TWIST_SHARING_STDDEV)], prior.tilt_stddev])
-    rows = prior.rows(q, lines).gradients[used] / stddev[used, None]
+    rows = rows[used] / table.stddev[used, None]
     _, singular, axes = np.linalg.svd(lines.jacobian.reshape(-1, MODEL.nv), full_matrices=False)
     free = axes[singular < 1e-6 * singular[0]].T
     assert free.shape[1] == 2

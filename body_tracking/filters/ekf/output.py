@@ -11,7 +11,6 @@ from body_tracking.filters.ekf.displacement import Displacement
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.priors import VAGUE
 from body_tracking.filters.ekf.state import State, StateSpace
-from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV
 
 _INFERRED = np.uint8(TrackingState.INFERRED)
 _UPDATES = 2
@@ -34,8 +33,7 @@ class Output:
         names = space.model.coordinate_names[6:]
         self._twists = np.array([name.startswith(("shoulder_z", "forearm_pronation")) for name in names])
         self._postural = np.flatnonzero(np.append(space.prior.postural, [True] * 3))
-        stddev = np.concatenate([space.prior.stddev, [np.radians(TWIST_SHARING_STDDEV)], space.prior.tilt_stddev])
-        self._posture_variance = stddev[self._postural] ** 2
+        self._posture_variance = space.prior_table.stddev[self._postural] ** 2
         self._last_handed_out: tuple[State, FloatArray, FloatArray] | None = None
 
     def forget(self) -> None:

@@ -14,7 +14,7 @@ from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.sensor_errors import SensorErrors
 from body_tracking.filters.ekf.sources import PER_SOURCE
 from body_tracking.filters.ekf.state import NOBODY, Measurement, SensorState, State, StateSpace
-from body_tracking.kinematics.inverse import InverseKinematics
+from body_tracking.kinematics.compiled_posture import CompiledInverse
 from body_tracking.kinematics.lengths import SegmentLengths
 
 _REST_NS = NANOSECONDS // 4
@@ -71,7 +71,7 @@ class PoseSearch:
     ) -> None:
         self._space, self._model, self._motion, self._sensors = space, space.model, motion, sensors
         self._parameters, self._counters, self._gate = parameters, counters, parameters.gate
-        self.inverse = InverseKinematics(space.model, space.ranges)
+        self.inverse = CompiledInverse(space.model, space.ranges, space.prior_table)
         self.started_by: tuple[str, int] | None = None
         self._velocity_variance = np.full(space.nv, _FIRST_TURN_RATE**2)
         self._velocity_variance[:3] = _FIRST_SPEED**2

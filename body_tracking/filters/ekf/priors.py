@@ -8,8 +8,7 @@ from body_tracking.core.skeleton import NANOSECONDS, FloatArray, SingleArray
 from body_tracking.filters.ekf.kernels import pseudo_measured
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.state import State, StateSpace, single
-from body_tracking.kinematics.compiled_posture import prior_rows, soft_values
-from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV
+from body_tracking.kinematics.compiled_posture import excess_of, prior_rows, soft_values
 
 _PRIOR_PERIOD = 0.1
 """Seconds between updates by the ranges of motion."""
@@ -49,7 +48,7 @@ class Priors:
         self._parameters, self._counters = parameters, counters
         self._prior = space.prior
         # the pseudo-measurements: coordinates, sharing of a twist, and inclination of the pelvis
-        self._stddev = np.concatenate([self._prior.stddev, [np.radians(TWIST_SHARING_STDDEV)], self._prior.tilt_stddev])
+        self._stddev = space.prior_table.stddev
         self._range_stddev = np.append(self._ranges.stddev, self._stddev[-3:])
         self._postural = np.append(self._prior.postural, [True] * 3)
         # what points show of the pelvis and the neck says nothing of how sensors are put on
@@ -65,7 +64,7 @@ class Priors:
         coordinates, values, gradients = prior_rows(
             state.q, lines.posture.rotations[0], lines.rotation_jacobian[0], self._space.prior_table
         )
-        excess = self._ranges.excess_of(coordinates)
+        excess = excess_of(coordinates, self._space.prior_table)
         if state.sources.names:  # the posture prior is not validated with sensors whose mounting is being estimated
             values[:-3], stddev = coordinates - self._ranges.centre, self._range_stddev
         tangent = self._free(state)[0][space.tangent, space.tangent]
@@ -162,10 +161,8 @@ class Priors:
         that no body can follow, is stopped here at once.
         """
         for _ in range(_PROJECTIONS):
-            if self._ranges.certainly_within(state.q, _FAR_BEYOND):
-                return state
             values = soft_values(state.q, self._space.prior_table)
-            excess = self._ranges.excess_of(values)
+            excess = excess_of(values, self._space.prior_table)
             size = np.abs(excess)
             far = size > _FAR_BEYOND
             if not far.any():
