@@ -14,6 +14,7 @@ from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.measurement import INFERRED_FACTOR
 from body_tracking.core.orientation import SegmentOrientation
 from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton, TrackingState
+from body_tracking.filters.ekf.algebra import forward_substituted, whitening_of
 from body_tracking.filters.ekf.displacement import Displacement
 from body_tracking.filters.ekf.facing import Facing
 from body_tracking.filters.ekf.motion import Motion
@@ -569,3 +570,4 @@ def prepare() -> None:
         stamp_ns = number * NANOSECONDS // 30
         estimator.take(Skeleton(stamp_ns, "", positions, states, covariances=covariances))
     assert estimator.filtered is not None
+    forward_substituted(np.eye(3), whitening_of(np.eye(3)))  # which orientations and the smoother call by themselves

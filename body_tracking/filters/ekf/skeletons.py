@@ -148,7 +148,9 @@ class SkeletonUpdate:
         rows: IntArray = np.flatnonzero(np.repeat(used, 3))
         predicted_variance = seen.own[used].reshape(count, -1) @ _MEAN_VARIANCE - sensor.white[used]
         correction = np.zeros(len(state.covariance))
-        for left in reversed(range(LINEARISATIONS)):
+        # Cameras alone are as accurate with one linearisation. Against orientations that are far from a camera's arm it
+        # is one of few: a source would be taken for slipped.
+        for left in reversed(range(LINEARISATIONS if state.sources.names else 1)):
             sound, whitening, gain, white, covariance = solved(
                 seen.covariance, blocks, seen.cross, seen.innovation, state.covariance, rows
             )
