@@ -10,6 +10,8 @@ MARKERS_BAG := bags/markers_arm
 DEMO_MARKERS := demo_markers_output
 MESH_BAG := bags/mesh_reaching
 DEMO_MESH := demo_mesh_output
+CAMERA_BAG := bags/camera_reaching
+DEMO_CAMERA := demo_camera_output
 
 # Nothing of a sourced ROS install or of another virtual environment may leak into this one. The ROS wheels re-execute
 # Python once to find their libraries and mark that in the environment; with another environment's mark set they
@@ -30,7 +32,7 @@ export MPLBACKEND := Agg
 export PYTHONUNBUFFERED := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo demo-markers demo-mesh test test-all lint ros2-workspace bench docs clean
+.PHONY: help setup demo demo-markers demo-mesh demo-camera test test-all lint ros2-workspace bench docs clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z0-9-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 16
@@ -75,6 +77,12 @@ demo-mesh: $(STAMP) ## the same with depth images: from the mesh of a body to jo
 	$(BIN)/body_tracking mesh show $(DEMO_MESH)/recording -o $(DEMO_MESH)/mesh.png
 	@echo "recording: $(DEMO_MESH)/recording"
 
+demo-camera: $(STAMP) ## the same with colour and depth images: from the people in them to joint angles
+	@rm -rf $(DEMO_CAMERA) && mkdir $(DEMO_CAMERA)
+	$(BIN)/body_tracking up --bag $(CAMERA_BAG) --camera camera1 --compressed colour --record $(DEMO_CAMERA)/recording --log-dir $(DEMO_CAMERA)/log
+	$(BIN)/body_tracking show $(DEMO_CAMERA)/recording --truth $(CAMERA_BAG) --output $(DEMO_CAMERA)/joint_angles.png
+	@echo "recording: $(DEMO_CAMERA)/recording"
+
 # The tests that compute, and lint, take what is left of the processors by those that start processes; of these two run at
 # a time, and one at a time where they state how soon something happens. All of it runs, whatever fails. The workspace for
 # test/ros2 is made before, and does not count as time of the tests.
@@ -114,5 +122,5 @@ docs: $(STAMP) ## rewrite what the code defines: tables of docs/reference.md, co
 	$(BIN)/python docs/update.py
 
 clean: ## remove everything that make and colcon made
-	rm -rf $(VENV) $(DEMO) $(DEMO_MARKERS) .ros2_workspace build install log dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) $(DEMO) $(DEMO_MARKERS) $(DEMO_MESH) $(DEMO_CAMERA) .ros2_workspace build install log dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find . -name __pycache__ -not -path './.git/*' -prune -exec rm -rf {} +
