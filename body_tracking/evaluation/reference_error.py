@@ -7,6 +7,11 @@ The difference is e = (error of the estimate) - (error of the reference), and bo
 with the variance V that the reference states: noise of its poses, its clock, the mountings of its targets. The interval
 is that of a variance (Satterthwaite 1946): chi squared with as many degrees of freedom as the scatter of |e|^2 gives,
 where samples count by their autocorrelation and an error of a mounting is one draw for a whole half.
+
+A mounting that is fitted to one half has the estimate's mean error there in it, whose variance the autocorrelation
+within a half tells only of errors that change within it. Errors that last longer show as the change of the mean from
+one half to the other: each half is compared by the mountings of the other, so that the change c is the difference of
+both means, and c c^T / 2 what one draw says of the variance of each. What it exceeds the stated variance by is added.
 """
 
 from __future__ import annotations
@@ -101,6 +106,10 @@ def judge(name: str, parts: Sequence[Differences], *, mountings_known: bool) -> 
     squares = np.array([float((part.errors**2).sum(axis=1).mean()) for part in parts])
     means = [part.errors.mean(axis=0) for part in parts]
     mountings = [part.mounting.mean(axis=0) for part in parts]
+    change = 0.5 * (means[-1] - means[0])
+    if not mountings_known:
+        surplus = _lasting(change, parts, mountings)
+        mountings = [mounting + surplus for mounting in mountings]
     variances = [
         float(part.variance.mean()) + float(np.trace(mounting)) for part, mounting in zip(parts, mountings, strict=True)
     ]
@@ -121,7 +130,6 @@ def judge(name: str, parts: Sequence[Differences], *, mountings_known: bool) -> 
     low, high = (freedom * measured / chi2.ppf(each, freedom) for each in (1.0 - tail, tail))
     low, high = (low, high) if poor else (max(low - reference, 0.0), max(high - reference, 0.0))
     offset, offset_stddev = _offset(parts, share, means, mountings) if mountings_known else (np.nan, np.nan)
-    change = 0.5 * (means[-1] - means[0])
     return Judged(
         name,
         int(count.sum()),
@@ -135,6 +143,24 @@ def judge(name: str, parts: Sequence[Differences], *, mountings_known: bool) -> 
         _signed(change),
         _covered(parts),
     )
+
+
+def _lasting(change: FloatArray, parts: Sequence[Differences], mountings: Sequence[FloatArray]) -> FloatArray:
+    """(d, d) by how much the change (d,) of the mean exceeds what mountings and samples state, as variance of a mean.
+
+    Args:
+        change: of the mean, half of the difference of both halves' means.
+        parts: both halves.
+        mountings: (d, d) the stated covariance of each by its mountings.
+    """
+    size = float(np.linalg.norm(change))
+    direction = change / max(size, 1e-12)
+    stated = [
+        float(direction @ mounting @ direction) + _variance_of_mean(part.errors @ direction, part.step)
+        for part, mounting in zip(parts, mountings, strict=True)
+    ]
+    surplus = max(0.5 * size**2 - 0.5 * float(np.mean(stated)), 0.0)
+    return np.asarray(surplus * np.outer(direction, direction))
 
 
 def _signed(vector: FloatArray) -> float:

@@ -216,6 +216,24 @@ def test_the_error_of_the_estimate_is_the_difference_without_the_references() ->
 
 
 @pytest.mark.slow
+def test_errors_that_last_longer_than_half_of_the_recording_are_in_the_interval() -> None:
+    """Each half has a constant error beside noise; the mounting is that of the other half, stated to be exact."""
+    rng = np.random.default_rng(8)
+    lasting, noise, inside = 2.0, 1.0, []
+    for _ in range(200):
+        means = rng.normal(0.0, lasting, 2)
+        parts = []
+        for mean, other in (means, means[::-1]):
+            errors = mean - other + rng.normal(0.0, noise, (300, 1))
+            parts.append(Differences(0.03, errors, np.zeros(300), np.full((300, 1, 1), 1e-6)))
+        found = judge("angle", parts, mountings_known=False)
+        assert found is not None
+        # what a mounting for the whole recording leaves
+        true = np.hypot(noise, 0.5 * abs(means[0] - means[1]))
+        inside.append(found.low <= true <= found.high if not found.too_poor else found.high >= true)
+    assert np.mean(inside) > 0.9
+
+
 def test_known_errors_are_in_their_intervals_over_people() -> None:
     """3 degrees of noise in all joints, 5 of bias, over 16 people; noisier markers are named too poor."""
     inside, poor, all_poor = [], [], []
