@@ -10,6 +10,7 @@ Replayed with each filter, the estimate is judged as ``body_tracking evaluate ES
   error, by the same fit to the exact orientations of the whole recording: what markers can show of it.
 - ``inside``: share of angles whose error lies in the interval, of those for which the reference is not too poor; of
   ``not absorbed``, and of ``true``.
+- ``refused``: recordings without a result, as too little of their movement is in the estimate.
 - ``clock``: error of the offset, which has the filter's delay in it, in ms, beside its stated deviation.
 
 ``pendulum``: orientations of a real pendulum's links from raw inertial data (RepoIMU), judged by Vicon as if its
@@ -37,7 +38,7 @@ from body_tracking.evaluation.estimated_segments import joint_chains, read_segme
 from body_tracking.evaluation.hand_eye import HandEyeError, Mounting, Track, fit_hand_eye
 from body_tracking.evaluation.marker_reference import read_marker_reference
 from body_tracking.evaluation.metrics import wrapped
-from body_tracking.evaluation.reading import read_truth
+from body_tracking.evaluation.reading import EvaluationError, read_truth
 from body_tracking.evaluation.reference_comparison import ReferenceEvaluation, evaluate_by_markers
 from body_tracking.inertial.clock import clock_offset, turning
 from body_tracking.recording.replay import ReplaySettings, replay
@@ -86,8 +87,8 @@ class Case:
     angles: tuple[Angle, ...]
 
 
-def judge(job: Job) -> Case:
-    """Simulate, replay, judge."""
+def judge(job: Job) -> Case | None:
+    """Simulate, replay, judge; None where it is refused."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         recording = simulate(Setup(job.motion, seconds=SECONDS, seed=FIRST_SEED + job.seed))
@@ -101,7 +102,11 @@ def judge(job: Job) -> Case:
         worn = wear_targets(times, q, rng, segments=("upper_trunk", *ARM), offset=OFFSET, drift=DRIFT)
         write_targets(worn, folder / "markers", int(truth.stamps_ns[0]))
         estimate = read_segments(folder / "out")
-        result = evaluate_by_markers(estimate, read_marker_reference(folder / "markers"))
+        try:
+            result = evaluate_by_markers(estimate, read_marker_reference(folder / "markers"))
+        except EvaluationError as error:
+            common.progress(f"{job}: {error}")
+            return None
         rotations = MODEL.forward(q, MODEL.default_lengths()).rotations
         everywhere = np.zeros((len(times), 3, 3))
         true = {segment: Track(times, rotations[:, SEGMENT_NUMBER[segment]], everywhere) for segment in worn.segments}
@@ -237,13 +242,14 @@ def main() -> None:
     """The benchmark."""
     args = common.parser(__doc__, seeds=2, jobs=True, data=True).parse_args()
     jobs = [Job(*each) for each in product(MOTIONS, FILTERS, range(args.seeds))]
-    cases = common.mapped(judge, jobs, args.jobs)
+    cases = [case for case in common.mapped(judge, jobs, args.jobs) if case is not None]
     folder = args.data / "imu" / "pendulum_with_reference"
     links = pendulum(folder) if folder.is_dir() else []
     stated = [angle for case in cases for angle in case.angles if np.isfinite(angle.error)]
     ratios = np.array([angle.error / angle.not_absorbed for angle in stated])
     figures = {
         "stated of all angles": [len(stated), sum(len(case.angles) for case in cases)],
+        "refused": len(jobs) - len(cases),
         "inside: not absorbed": np.mean([angle.low <= angle.not_absorbed <= angle.high for angle in stated]),
         "inside: true": np.mean([angle.low <= angle.true <= angle.high for angle in stated]),
         "by markers / not absorbed, 10, 50 and 90 %": np.percentile(ratios, [10.0, 50.0, 90.0]),
