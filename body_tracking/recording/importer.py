@@ -1,9 +1,10 @@
 """``body_tracking import``: recordings of other formats, one or several views, as one bag.
 
 Skeletons go to ``/<sensor>/skeleton``, inertial readings to ``/<sensor>/imu/data`` (with orientation) or
-``/<sensor>/imu/data_raw``, and ``/<sensor>/imu/mag``; joint angles in a file to ``/ground_truth/joint_states``; points
-of another motion capture system to ``/markers/points``. A message's header stamp is the sensor's own clock exactly as
-recorded; the bag's log time is the time of receipt.
+``/<sensor>/imu/data_raw``, and ``/<sensor>/imu/mag``; depth images and body index to the topics of a depth camera;
+joint angles in a file to ``/ground_truth/joint_states``; points of another motion capture system to
+``/markers/points``. A message's header stamp is the sensor's own clock exactly as recorded; the bag's log time is the
+time of receipt.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ import numpy as np
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.imu import RecordedAngles, RecordedImu
 from body_tracking.core.joint_angles import JointAngles
-from body_tracking.core.message_types import IMU, JOINT_STATE, MAGNETIC_FIELD, POINT_CLOUD
-from body_tracking.core.qos import RELIABLE, SENSOR_DATA, Qos
+from body_tracking.core.message_types import IMAGE, IMU, JOINT_STATE, MAGNETIC_FIELD, POINT_CLOUD
+from body_tracking.core.qos import LATCHED, RELIABLE, SENSOR_DATA, Qos
 from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.core.sources import RecordedFrame, Recording
 from body_tracking.inertial.imu_csv import ImuCsvRecording, is_imu_csv
@@ -34,12 +35,18 @@ from body_tracking.markers import setup
 from body_tracking.markers.messages import points_to_cloud
 from body_tracking.markers.trajectories import (
     DEFAULT_NOISE,
+    FRAME,
     RecordedPoints,
     TrajectoryRecording,
     is_trajectory_file,
     labels_in,
+    points_of,
 )
+from body_tracking.mesh.ntu_mocap import NtuMocapRecording, RecordedDepth, RecordedMarkers, is_ntu_mocap
+from body_tracking.mesh.topics import IMAGES, body_index_topic, depth_topic, info_topic
 from body_tracking.messages.angles import angles_to_joint_states
+from body_tracking.messages.cameras import CAMERA_INFO, camera_to_info
+from body_tracking.messages.images import array_to_image
 from body_tracking.messages.imus import sample_to_messages
 from body_tracking.messages.skeletons import skeletons_to_cloud
 from body_tracking.pipeline.graph import DEFAULT_BODY, TRUE_ANGLES
@@ -51,7 +58,7 @@ CSV_SUFFIXES = (".csv", ".csv.gz")
 NTU_SUFFIX = ".skeleton"
 MVNX_SUFFIXES = (".mvnx", ".mvnx.gz")
 
-_Item = RecordedFrame | RecordedImu | RecordedAngles | RecordedPoints
+_Item = RecordedFrame | RecordedImu | RecordedAngles | RecordedPoints | RecordedDepth | RecordedMarkers
 _Recording = Recording[_Item]
 _Message = tuple[str, str, Qos, object]
 """Topic, its type and quality, message."""
@@ -137,7 +144,9 @@ def open_recording(path: Path, sensor: str | None = None, partial: bool = False)
 
 
 def _open_any(path: Path, name: str | None, partial: bool, labels: Sequence[str], noise: float) -> _Recording:
-    """The reader for a file of skeletons, of inertial readings or of points."""
+    """The reader for a file of skeletons, of inertial readings or of points, or for a folder with all of them."""
+    if is_ntu_mocap(path):
+        return NtuMocapRecording(path, name, partial)
     if path.is_file():
         if is_trajectory_file(path):
             if name is not None:
@@ -267,6 +276,20 @@ def _messages(item: _Item) -> list[_Message]:
     if isinstance(item, RecordedFrame):
         cloud = skeletons_to_cloud(item.skeletons, BAG_MESSAGES)
         return [(f"/{item.sensor}/skeleton", POINT_CLOUD, SENSOR_DATA, cloud)]
+    if isinstance(item, RecordedDepth):
+        frame_id, at_ns = item.camera.frame_id, item.received_ns
+        image = array_to_image(item.depth, at_ns, frame_id, BAG_MESSAGES, "16UC1")
+        depth: list[_Message] = [
+            (info_topic(item.sensor), CAMERA_INFO, LATCHED, camera_to_info(item.camera, at_ns, BAG_MESSAGES)),
+            (depth_topic(item.sensor), IMAGE, IMAGES, image),
+        ]
+        if item.bodies is not None:
+            index = array_to_image(item.bodies, at_ns, frame_id, BAG_MESSAGES)
+            depth.insert(1, (body_index_topic(item.sensor), IMAGE, IMAGES, index))
+        return depth
+    if isinstance(item, RecordedMarkers):
+        points = points_of(item.positions, item.received_ns, FRAME, DEFAULT_NOISE)
+        return [(setup.POINTS, POINT_CLOUD, RELIABLE, points_to_cloud(points, BAG_MESSAGES))]
     if isinstance(item, RecordedPoints):
         return [(setup.POINTS, POINT_CLOUD, RELIABLE, points_to_cloud(item.points, BAG_MESSAGES))]
     if isinstance(item, RecordedAngles):

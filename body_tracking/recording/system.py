@@ -80,7 +80,8 @@ SYSTEM = System(
         Command(
             "import",
             "body_tracking.recording.importer",
-            "convert other formats into a bag: CSV, NTU RGB+D .skeleton, Xsens .mvnx, C3D",
+            "convert other formats into a bag: CSV, NTU RGB+D .skeleton, Xsens .mvnx, C3D, folders of the NTU motion "
+            "capture data set",
         ),
         Command("bag", "body_tracking.recording.info", "list the contents of recordings, close one that was cut off"),
         Command("replay", "body_tracking.recording.replay", "run the whole graph offline over a bag"),
