@@ -249,7 +249,7 @@ class Performed(DepthScene):
         rng = np.random.default_rng([self.seed, 32])
         side = rng.choice([-1.0, 1.0])
         start = np.array([rng.uniform(-0.6, 0.6), side * rng.uniform(2.1, 2.5)])
-        return Walk(start, rng.uniform(-0.4, 0.4, 2), float(rng.uniform(0.8, 1.4)), float(rng.uniform(0.5, 0.6)))
+        return Walk(start, rng.uniform(-0.4, 0.4, 2), float(rng.uniform(0.7, 1.1)), float(rng.uniform(0.5, 0.55)))
 
 
 _MOVES = {"bend": posture(trunk_lateral=28.0, pelvis_lateral=3.0), "shrug": posture(shrug=24.0, elbow=4.0)}

@@ -482,9 +482,8 @@ class _System:
     def add_turns(self, gradients: FloatArray, weights: FloatArray, pull: FloatArray) -> None:
         """Residuals (J, 3) of each joint's own turn, by its gradients (J, 3, 3)."""
         blocks = np.tril(np.einsum("jba,jb,jbc->jac", gradients, weights, gradients))
-        for joint, block in enumerate(blocks):
-            at = slice(3 + 3 * joint, 6 + 3 * joint)
-            self.information[at, at] += block
+        at = 3 + np.arange(3 * len(blocks)).reshape(-1, 3)
+        self.information[at[:, :, None], at[:, None, :]] += blocks
         self.gradient[3:] += np.einsum("jba,jb->ja", gradients, pull).ravel()
 
 

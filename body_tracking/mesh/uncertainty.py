@@ -160,10 +160,22 @@ def placed(
     return Placed(points, covariance, np.diag(pose).copy())
 
 
+@compiled
 def pose_rows(arms: FloatArray, directions: FloatArray, frames: FloatArray) -> FloatArray:
     """(n, 3 + 3 J) derivatives of points (by their lever arms, (n, J, 3)) along directions (n, 3) by the pose."""
-    turns = np.einsum("nja,jab->njb", np.cross(arms, directions[:, None]), frames)
-    return np.concatenate([directions, turns.reshape(len(arms), 3 * len(frames))], axis=1)
+    count, joints = arms.shape[0], arms.shape[1]
+    rows = np.zeros((count, 3 + 3 * joints))
+    for n in range(count):
+        dx, dy, dz = directions[n, 0], directions[n, 1], directions[n, 2]
+        rows[n, 0], rows[n, 1], rows[n, 2] = dx, dy, dz
+        for j in range(joints):
+            sx, sy, sz = arms[n, j, 0], arms[n, j, 1], arms[n, j, 2]
+            if sx == 0.0 and sy == 0.0 and sz == 0.0:
+                continue
+            cx, cy, cz = sy * dz - sz * dy, sz * dx - sx * dz, sx * dy - sy * dx
+            for a in range(3):
+                rows[n, 3 + 3 * j + a] = frames[j, 0, a] * cx + frames[j, 1, a] * cy + frames[j, 2, a] * cz
+    return rows
 
 
 def joint_shape_gradients(model: BodyModel, posed: PosedBody) -> FloatArray:
