@@ -35,7 +35,6 @@ from body_tracking.core.imu import STANDARD_GRAVITY, ImuSample, ImuSampleError, 
 from body_tracking.core.protobuf import Fields, ProtobufError, fields, message, number, signed
 from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton, TrackingState
 from body_tracking.core.sources import RecordedFrame, check_sensor_name, optical_frame
-from body_tracking.kinect.axes import camera_space_to_optical
 
 WIDTH, HEIGHT = 512, 424
 DEPTH_FILE: Final = "kinect/depthBuffer.bin"
@@ -53,6 +52,8 @@ _TESLA: Final = 0.080e-7
 """Tesla per count of the magnetometer: 0.08 milligauss."""
 _PLACES: Final = {1: "camera", 2: "forearm_left", 3: "forearm_right"}
 """Where an inertial sensor is, by the field of ``SettingProto`` that has its number."""
+_TO_OPTICAL: Final = np.array([-1.0, -1.0, 1.0])
+"""From camera space (x to the sensor's left, y up) to the optical frame."""
 _OFF: Final = 2e-3
 """Largest difference of a ray's x and y between intrinsics and table within the middle of the image: a pixel."""
 BAD: Final = "readings that no inertial sensor can have made"
@@ -273,7 +274,7 @@ class NtuMocapRecording:
             position = np.array([number(point, axis) for axis in (1, 2, 3)])
             if state != TrackingState.NOT_TRACKED and np.isfinite(position).all():
                 positions[joint], states[joint] = position, state
-        return Skeleton(stamp_ns, optical_frame(self._sensor), camera_space_to_optical(positions), states, place)
+        return Skeleton(stamp_ns, optical_frame(self._sensor), positions * _TO_OPTICAL, states, place)
 
     def _readings(self) -> Iterator[RecordedImu]:
         if not self._there(_SETTING, "setting of the inertial sensors"):
