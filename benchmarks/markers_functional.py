@@ -7,7 +7,8 @@ Poses of clusters by an unweighted fit (Umeyama 1991) of the mean shape, whose m
   the closed form (SARA), and over frames of a bend that is in both halves. ``floor``: RMS over that bend, in steps of
   5 deg, of how far the shank is turned out of the hinge's plane in one half against the other. At one and the same bend
   it is what no hinge explains, nor any joint of one degree of freedom: the knee turns about its long axis, and the
-  clusters move on the skin. The axis of a half cannot be known better than by that.
+  clusters move on the skin. No joint of one degree of freedom explains that, which shows the size of what is beyond a
+  hinge; it is no strict bound on the axis.
 - ``hip``: the ball joint between the pelvis' markers and the thigh's cluster. ``hip, wrong``: with the epicondyles as
   part of the thigh's cluster, which is not rigid then.
 - ``elbow``: a hinge between upper arm and forearm, which bend by 9 (left) and 15 deg (right).
