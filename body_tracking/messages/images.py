@@ -104,6 +104,6 @@ def array_to_image(pixels: NDArray[Any], stamp_ns: int, frame_id: str, types: Me
         width=width,
         encoding=encoding or ("mono8" if pixels.dtype.itemsize == 1 else "mono16"),
         is_bigendian=0,
-        step=rows.nbytes // height,
+        step=width * rows.dtype.itemsize * (rows.shape[2] if rows.ndim == 3 else 1),
         data=types.octets(rows.tobytes()),
     )

@@ -12,7 +12,6 @@ from body_tracking.core.names import WHOLE_DOMAIN
 from body_tracking.pipeline import graph
 from body_tracking.recording.rosbag2 import BagReader
 from draws import some
-from excerpts import beginning
 from pose_networks import MISSING, REASON
 
 ANGLES = graph.joint_states_topic("body1")
@@ -65,9 +64,11 @@ def test_a_rig_in_a_namespace_keeps_its_topics_there_and_ends_with_its_bag(tools
 @pytest.mark.skipif(bool(MISSING), reason=REASON)
 def test_colour_and_depth_cameras_have_a_launch_of_their_own(tools: Tools) -> None:
     angles = tools.bench.collect(JointState, ANGLES)
-    bag = beginning(tools.share / "bags" / "camera_reaching", tools.folder / "excerpt", 1.5)
-    launch = tools.launch(f"bag:={bag}", "driver:=plain", "compressed:=colour", file="cameras.launch.py")
+    bag = tools.share / "bags" / "camera_reaching"
+    given = f"bag:={bag}", "driver:=plain", "compressed:=colour", "rate:=0.4"
+    launch = tools.launch(*given, file="cameras.launch.py")
     assert tools.bench.until(lambda: angles, SOON), launch.text()
+    launch.interrupt()
     assert launch.ended() == 0, launch.text()
     assert "Traceback" not in launch.text() and "[ERROR]" not in launch.text()
 
