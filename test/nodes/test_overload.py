@@ -81,7 +81,8 @@ def test_slow_node_drops_old_frames_and_reports_them(slow: Slow) -> None:
     assert set(backlog) == set(TOPICS)
     for topic in TOPICS:
         handled = sum(each == topic for each, _ in slow.waited)
-        assert handled + backlog[topic] + lost[topic] == sent
+        # a loss shows with the next frame, and the last ones have none
+        assert sent - 2 <= handled + backlog[topic] + lost[topic] <= sent
         assert backlog[topic] > lost[topic]
     # no standing queue: the frames handled last are recent, and few remain
     late = [seconds for _, seconds in slow.waited[before // 2 : before]]
