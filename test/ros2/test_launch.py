@@ -21,7 +21,7 @@ SOON = 180.0
 
 def test_a_recording_becomes_angles_and_filter_and_convention_may_change_meanwhile(tools: Tools) -> None:
     angles = tools.bench.collect(JointState, ANGLES)
-    launch = tools.launch(f"bag:={tools.bag('tpose_torso_twist')}", "record:=live", "filter:=ekf", "rate:=0.5")
+    launch = tools.launch(f"bag:={tools.bag('tpose_torso_twist')}", "record:=live", "filter:=ekf", "rate:=0.2")
 
     def comes(convention: str) -> bool:
         """From now on."""
