@@ -53,7 +53,7 @@ setup(
         "matplotlib>=3.8",
         "filterpy>=1.4.5",
         "vqf>=2.1",
-        "numba>=0.59",
+        "numba>=0.62",
         "mcap>=1.2",
         "lz4>=4",
         "zstandard>=0.22",

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import time
+from concurrent.futures import ProcessPoolExecutor, as_completed
 
 from body_tracking.pipeline.system import load
 from body_tracking.systems import SYSTEMS
@@ -12,18 +14,24 @@ from body_tracking.systems import SYSTEMS
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the subcommand ``compile``."""
     text = (
-        "Compiles the loops of the image processing and of the filter ekf, and keeps the machine code beside the "
-        "package or in the user's cache folder. Otherwise the first node that needs them takes half a minute to start."
+        "Compiles the loops of the image processing and of the filter ekf, and keeps the machine code in the user's "
+        "cache folder. Otherwise the first node that needs them takes half a minute to start."
     )
     subparsers.add_parser("compile", help=text, description=text).set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """The subcommand."""
-    for system in SYSTEMS:
-        if system.prepare:
-            began = time.perf_counter()
-            print(f"{system.name} ...", end=" ", flush=True)
-            load(system.prepare)()
-            print(f"{time.perf_counter() - began:.1f} s", flush=True)
+    """The subcommand: each system in a process of its own, since numba compiles one function at a time."""
+    functions = {system.name: system.prepare for system in SYSTEMS if system.prepare}
+    with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool:
+        names = {pool.submit(_seconds, function): name for name, function in functions.items()}
+        for done in as_completed(names):
+            print(f"{names[done]}: {done.result():.1f} s", flush=True)
     return 0
+
+
+def _seconds(function: str) -> float:
+    """Seconds that ``module:function`` takes."""
+    began = time.perf_counter()
+    load(function)()
+    return time.perf_counter() - began

@@ -11,6 +11,7 @@ from pathlib import Path, PurePosixPath
 from typing import Final
 
 from body_tracking.camera.pose_model import DETECTOR_FILE, LANDMARKS_FILE, PoseModelError
+from body_tracking.core.files import user_cache
 
 FOLDER_VARIABLE: Final = "BODY_TRACKING_POSE_MODEL"
 """Environment variable with the folder of the networks."""
@@ -25,10 +26,7 @@ _LARGEST: Final = 64 << 20
 def default_folder() -> Path:
     """The folder of :data:`FOLDER_VARIABLE`, else one in the user's cache (XDG base directories)."""
     given = os.environ.get(FOLDER_VARIABLE)
-    if given:
-        return Path(given).expanduser()
-    cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(cache).expanduser() / "body_tracking" / "pose_model"
+    return Path(given).expanduser() if given else user_cache() / "pose_model"
 
 
 def fetch(folder: Path) -> None:

@@ -5,26 +5,109 @@ Importing numba takes half a second: only modules that run such loops import thi
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import hashlib
+import os
+import shutil
+from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
+from numba.core.caching import UserWideCacheLocator
+
+from body_tracking.core.files import user_cache
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 LOOPS: list[Any] = []
 """All compiled functions of the modules that have been imported."""
 
+_VERSIONS_KEPT = 4
+"""Of a module's machine code: those of as many checkouts as one works with side by side."""
+
+_digests: dict[str, str] = {}
+"""By the names of modules that have compiled functions."""
+
 
 def compiled(function: _Function) -> _Function:
     """Compile a function of numbers and arrays; its types stay those of the Python function.
 
-    The machine code is kept beside the module, or in the user's cache folder where that one cannot be written to.
-    Where neither can, each process compiles anew.
+    The machine code is kept in the user's cache folder; where that one cannot be written to, each process compiles
+    anew.
     """
+    before = numba.config.CACHE_LOCATOR_CLASSES
+    numba.config.CACHE_LOCATOR_CLASSES = f"{__name__}.{ByContent.__name__}"
     try:
         loop = numba.njit(cache=True, error_model="numpy")(function)
     except RuntimeError:  # numba's: "no locator available"
         loop = numba.njit(error_model="numpy")(function)
+    finally:
+        numba.config.CACHE_LOCATOR_CLASSES = before
     LOOPS.append(loop)
     return cast("_Function", loop)
+
+
+class ByContent(UserWideCacheLocator):  # type: ignore[misc]
+    """Machine code in a folder that is named after all that it was made of.
+
+    numba's own locators compare nothing but the file of the function itself: where a function or a constant that it
+    imports from another module changes, they go on with the old one. Copies of the package with equal modules (an
+    installed one, a workspace, a second checkout) share what was compiled.
+    """
+
+    def __init__(self, function: Any, path: str) -> None:
+        """For one function, in the file of this path."""
+        super().__init__(function, path)
+        self._digest = digest(function, path)
+        self._cache_path = str(user_cache() / "compiled" / f"{function.__module__}-{self._digest[:16]}")
+
+    def ensure_cache_path(self) -> None:
+        """Make the folder.
+
+        Raises:
+            OSError: it cannot be written to.
+        """
+        folder = Path(self._cache_path)
+        if not folder.exists():
+            module = folder.name.rpartition("-")[0]
+            _remove_oldest(folder.parent.glob(f"{module}-*"))
+        super().ensure_cache_path()
+
+    def get_source_stamp(self) -> str:
+        """Of what the code was made."""
+        return self._digest
+
+
+def digest(function: Any, path: str) -> str:
+    """Of a module's source, and of the compiled functions and the constants that it imports, as hexadecimal digits.
+
+    Args:
+        function: the first one of the module that is compiled: what it imports is there by then.
+        path: of the module's file.
+    """
+    module = function.__module__
+    if module not in _digests:
+        content = hashlib.sha256(Path(path).read_bytes())
+        for name, value in sorted(function.__globals__.items()):
+            if name.startswith("__"):
+                continue
+            origin = getattr(value, "py_func", value)  # of a compiled function; a module may be imported as a whole
+            within = _digests.get(getattr(origin, "__module__", None) or getattr(origin, "__name__", ""))
+            if within is not None:
+                content.update(f"{name} {within}\n".encode())
+            elif isinstance(value, np.ndarray):
+                content.update(f"{name} {value.dtype} {value.shape}\n".encode() + value.tobytes())
+            elif isinstance(value, bool | int | float | str | tuple) and " at 0x" not in repr(value):
+                content.update(f"{name} {value!r}\n".encode())
+        _digests[module] = content.hexdigest()
+    return _digests[module]
+
+
+def _remove_oldest(folders: Iterable[Path]) -> None:
+    """Remove all but the most recently used versions of a module's code, less the one that is to come."""
+    with contextlib.suppress(OSError):  # another process removes them too
+        newest_first = sorted(folders, key=os.path.getmtime, reverse=True)
+        for folder in newest_first[_VERSIONS_KEPT - 1 :]:
+            shutil.rmtree(folder, ignore_errors=True)

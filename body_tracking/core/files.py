@@ -39,6 +39,11 @@ class FileLimitError(FileError):
     """A file exceeds a limit: of size, nesting, aliases or digits."""
 
 
+def user_cache() -> Path:
+    """The package's folder in the user's cache (XDG base directories)."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "body_tracking"
+
+
 def open_regular(path: Path) -> BinaryIO:
     """Open a file for reading; never a FIFO or a device, whose reader may block forever.
 

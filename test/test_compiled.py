@@ -1,0 +1,77 @@
+"""Compiled functions: what machine code of theirs is kept, and when it is made anew."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+_USER = """
+from body_tracking.core.compiled import compiled
+from inner import OFFSET, inner
+
+@compiled
+def outer(x):
+    return inner(x) + OFFSET
+"""
+_INNER = """
+from body_tracking.core.compiled import compiled
+
+OFFSET = {offset}
+
+@compiled
+def inner(x):
+    return {factor} * x
+"""
+_SCRIPT = "from outer import outer; print(outer(1.0), sum(outer.stats.cache_hits.values()))"
+
+
+@pytest.fixture
+def cache(tmp_path: Path) -> Path:
+    return tmp_path / "cache"
+
+
+def run(folder: Path, cache: Path) -> str:
+    """The value of ``outer(1)`` in a new process, and whether its code came from the cache."""
+    path = os.pathsep.join([str(folder), *filter(None, sys.path)])
+    environment = {**os.environ, "PYTHONPATH": path, "XDG_CACHE_HOME": str(cache)}
+    command = [sys.executable, "-c", _SCRIPT]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=True).stdout
+
+
+def write(folder: Path, offset: float = 1.0, factor: float = 1.0) -> None:
+    folder.mkdir(exist_ok=True)
+    (folder / "outer.py").write_text(_USER)
+    (folder / "inner.py").write_text(_INNER.format(offset=offset, factor=factor))
+
+
+def test_code_is_compiled_anew_where_what_it_imports_changed_and_only_there(tmp_path: Path, cache: Path) -> None:
+    write(tmp_path / "one")
+    assert run(tmp_path / "one", cache).split() == ["2.0", "0"]
+    write(tmp_path / "copy")
+    assert run(tmp_path / "copy", cache).split() == ["2.0", "1"]
+    write(tmp_path / "one", offset=5.0)
+    assert run(tmp_path / "one", cache).split() == ["6.0", "0"]
+    write(tmp_path / "one", offset=5.0, factor=3.0)
+    assert run(tmp_path / "one", cache).split() == ["8.0", "0"]
+
+
+def test_only_the_versions_used_last_are_kept(tmp_path: Path, cache: Path) -> None:
+    write(tmp_path / "one")
+    for age, name in enumerate("abcdef"):
+        folder = cache / "body_tracking" / "compiled" / f"inner-{name}"
+        folder.mkdir(parents=True)
+        os.utime(folder, (1000.0 - age, 1000.0 - age))
+    run(tmp_path / "one", cache)
+    left = {each.name for each in (cache / "body_tracking" / "compiled").glob("inner-*")}
+    assert len(left) == 4
+    assert {"inner-a", "inner-b", "inner-c"} < left
+
+
+def test_without_a_folder_to_write_to_it_runs_all_the_same(tmp_path: Path) -> None:
+    write(tmp_path / "one")
+    (tmp_path / "file").touch()
+    assert run(tmp_path / "one", tmp_path / "file").split() == ["2.0", "0"]
