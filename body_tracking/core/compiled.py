@@ -37,19 +37,19 @@ def compiled(function: _Function) -> _Function:
     The machine code is kept in the user's cache folder; where that one cannot be written to, each process compiles
     anew.
     """
-    before = numba.config.CACHE_LOCATOR_CLASSES
-    numba.config.CACHE_LOCATOR_CLASSES = f"{__name__}.{ByContent.__name__}"
+    settings: Any = numba.config
+    before, settings.CACHE_LOCATOR_CLASSES = settings.CACHE_LOCATOR_CLASSES, f"{__name__}.{ByContent.__name__}"
     try:
         loop = numba.njit(cache=True, error_model="numpy")(function)
     except RuntimeError:  # numba's: "no locator available"
         loop = numba.njit(error_model="numpy")(function)
     finally:
-        numba.config.CACHE_LOCATOR_CLASSES = before
+        settings.CACHE_LOCATOR_CLASSES = before
     LOOPS.append(loop)
     return cast("_Function", loop)
 
 
-class ByContent(UserWideCacheLocator):  # type: ignore[misc]
+class ByContent(UserWideCacheLocator):
     """Machine code in a folder that is named after all that it was made of.
 
     numba's own locators compare nothing but the file of the function itself: where a function or a constant that it
@@ -59,7 +59,7 @@ class ByContent(UserWideCacheLocator):  # type: ignore[misc]
 
     def __init__(self, function: Any, path: str) -> None:
         """For one function, in the file of this path."""
-        super().__init__(function, path)
+        super().__init__(function, path)  # type: ignore[no-untyped-call]
         self._digest = digest(function, path)
         self._cache_path = str(user_cache() / "compiled" / f"{function.__module__}-{self._digest[:16]}")
 
@@ -73,7 +73,7 @@ class ByContent(UserWideCacheLocator):  # type: ignore[misc]
         if not folder.exists():
             module = folder.name.rpartition("-")[0]
             _remove_oldest(folder.parent.glob(f"{module}-*"))
-        super().ensure_cache_path()
+        super().ensure_cache_path()  # type: ignore[no-untyped-call]
 
     def get_source_stamp(self) -> str:
         """Of what the code was made."""
@@ -94,7 +94,7 @@ def digest(function: Any, path: str) -> str:
             if name.startswith("__"):
                 continue
             origin = getattr(value, "py_func", value)  # of a compiled function; a module may be imported as a whole
-            within = _digests.get(getattr(origin, "__module__", None) or getattr(origin, "__name__", ""))
+            within = _digests.get(str(getattr(origin, "__module__", getattr(origin, "__name__", ""))))
             if within is not None:
                 content.update(f"{name} {within}\n".encode())
             elif isinstance(value, np.ndarray):
