@@ -83,10 +83,10 @@ demo-camera: $(STAMP) ## the same with colour and depth images: from the people 
 	$(BIN)/body_tracking show $(DEMO_CAMERA)/recording --truth $(CAMERA_BAG) --output $(DEMO_CAMERA)/joint_angles.png
 	@echo "recording: $(DEMO_CAMERA)/recording"
 
-# The tests that compute, and lint, take what is left of the processors by those that start processes; of these two run at
-# a time, and one at a time where they state how soon something happens. All of it runs, whatever fails. The workspace for
-# test/ros2 is made before, and does not count as time of the tests.
-test: $(STAMP) ## formatting, lint, types and the tests, in ten minutes
+# The tests that compute, and lint, take what is left of the processors by those that start processes. These wait more than
+# they compute: three run at a time, and one at a time where they state how soon something happens. All of it runs, whatever
+# fails. The workspace for test/ros2 is made before, and does not count as time of the tests.
+test: $(STAMP) ## formatting, lint, types and the tests, in five minutes
 	@$(call tests,not slow)
 
 test-all: export TEST_DRAWS = all
@@ -98,7 +98,7 @@ failed=; $(MAKE) --no-print-directory ros2-workspace || { failed=", the workspac
 phase() { name="$$1"; shift; echo "== $$name"; $(BIN)/python -m pytest "$$@" || failed="$$failed, $$name"; }; \
 nice -n 19 $(MAKE) --no-print-directory lint >$(VENV)/lint.txt 2>&1 & lint=$$!; \
 nice -n 19 $(BIN)/python -m pytest -m "($(1)) and not processes" --numprocesses 2 --dist worksteal >$(VENV)/compute.txt 2>&1 & compute=$$!; \
-phase "tests of processes" -m "($(1)) and processes and not alone" --numprocesses 2 --dist loadscope --no-loadscope-reorder; \
+phase "tests of processes" -m "($(1)) and processes and not alone" --numprocesses 3 --dist loadscope --no-loadscope-reorder; \
 phase "tests of time" -m "($(1)) and processes and alone"; \
 echo "== tests that compute"; wait $$compute || failed="$$failed, tests that compute"; cat $(VENV)/compute.txt; \
 echo "== formatting, lint, types"; wait $$lint || failed="$$failed, formatting, lint, types"; cat $(VENV)/lint.txt; \

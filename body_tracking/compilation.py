@@ -21,9 +21,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
-    """The subcommand: each system in a process of its own, since numba compiles one function at a time."""
+    """The subcommand: each system in a process of its own, since numba compiles one function at a time.
+
+    They are forked: a new interpreter would run the script again that an install has made of this command.
+    """
     functions = {system.name: system.prepare for system in SYSTEMS if system.prepare}
-    with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool:
+    with ProcessPoolExecutor(mp_context=multiprocessing.get_context("fork")) as pool:
         names = {pool.submit(_seconds, function): name for name, function in functions.items()}
         for done in as_completed(names):
             print(f"{names[done]}: {done.result():.1f} s", flush=True)
