@@ -37,7 +37,8 @@ def cache(tmp_path: Path) -> Path:
 def run(folder: Path, cache: Path) -> str:
     """The value of ``outer(1)`` in a new process, and whether its code came from the cache."""
     path = os.pathsep.join([str(folder), *filter(None, sys.path)])
-    environment = {**os.environ, "PYTHONPATH": path, "XDG_CACHE_HOME": str(cache)}
+    # Python's own cache takes a file of the same size and second for the same
+    environment = {**os.environ, "PYTHONPATH": path, "XDG_CACHE_HOME": str(cache), "PYTHONDONTWRITEBYTECODE": "1"}
     command = [sys.executable, "-c", _SCRIPT]
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=True).stdout
 
