@@ -43,6 +43,12 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
     return top
 
 
+def _joined(arguments: Sequence[str]) -> Sequence[str]:
+    """The arguments with the two words of a command such as ``evaluate baseline`` as one."""
+    both = " ".join(arguments[:2])
+    return [both, *arguments[2:]] if both in subcommands() else arguments
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code: 2 with one line on stderr for anything wrong outside the program."""
     if arguments is None:
@@ -50,6 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # they wait. The variable has to be set before numpy is loaded, with the first subcommand.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         arguments = sys.argv[1:]
+    arguments = _joined(arguments)
     try:
         args = parser(arguments[0] if arguments else None).parse_args(arguments)
         code: int = args.run(args)

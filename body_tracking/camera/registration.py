@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 
@@ -12,6 +13,10 @@ from body_tracking.core.compiled import compiled
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import FloatArray, SingleArray
 from body_tracking.mesh.depth import DepthCamera, check_size
+
+_UNLIKE: Final = 0.02
+"""Difference of focal length or principal point, as a share of the image's width, from which on depth images are not
+registered to the colour images."""
 
 
 class Registration:
@@ -70,6 +75,13 @@ def _splat(pixels: FloatArray, distances: FloatArray, height: int, width: int) -
                 if image[i, j] == 0.0 or distances[k] < image[i, j]:
                     image[i, j] = distances[k]
     return image
+
+
+def is_registered(colour: Camera, depth: Camera) -> bool:
+    """Whether two calibrations are of one camera, whose images may differ in their number of pixels."""
+    scale = np.array([depth.width / colour.width, depth.height / colour.height])
+    off = depth.matrix[:2] - colour.matrix[:2] * scale[:, None]
+    return bool(np.abs(off).max() < _UNLIKE * depth.width)
 
 
 def moved(found: Landmarks, source: Camera, target: Camera) -> Landmarks:

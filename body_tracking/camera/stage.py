@@ -17,7 +17,7 @@ from body_tracking.camera.model_files import default_folder
 from body_tracking.camera.people import PersonTracker
 from body_tracking.camera.pictures import RATE, Pictures
 from body_tracking.camera.pose_model import ImageArray, Landmarks, PoseModel
-from body_tracking.camera.registration import Registration, moved
+from body_tracking.camera.registration import Registration, is_registered, moved
 from body_tracking.camera.topics import COMPRESSION, DRIVERS, CameraTopics, images_of
 from body_tracking.core.camera import Camera, CameraError
 from body_tracking.core.parameters import Parameter, Value
@@ -79,9 +79,6 @@ _KEPT: Final = 64
 """Images of a topic that wait with the parameter ``reliable``: two seconds, 60 MB in colour at 640x480."""
 _WAIT_NS: Final = NANOSECONDS // 10
 """Longest wait of an image for the other one."""
-_UNLIKE: Final = 0.02
-"""Difference of focal length or principal point, as a share of the image's width, from which on depth images are not
-registered to the colour images."""
 FLAT: Final = "the person is flat: a picture of one?"
 
 
@@ -246,7 +243,7 @@ class ColourAndDepth:
         if len(self._infos) < 2:
             return
         colour, depth = self._infos[_COLOUR], self._infos[_DEPTH]
-        if self._pose is None and not _registered(colour, depth):
+        if self._pose is None and not is_registered(colour, depth):
             self._problem = (
                 f"the depth images are not registered to the colour images: {self.topics.depth_info} has other "
                 "intrinsics. Let the driver register them, or set depth_pose"
@@ -354,13 +351,6 @@ def _pose(numbers: tuple[str, ...]) -> SensorPose | None:
     if values.shape != (7,) or not np.isfinite(values).all() or not np.linalg.norm(values[3:]) > 0.5:
         raise graph.GraphError(f"depth_pose: {', '.join(numbers)}; expected x, y, z and a unit quaternion x, y, z, w")
     return SensorPose(_DEPTH, values[:3], values[3:])
-
-
-def _registered(colour: Camera, depth: Camera) -> bool:
-    """Whether two calibrations are of one camera, whose images may differ in their number of pixels."""
-    scale = np.array([depth.width / colour.width, depth.height / colour.height])
-    off = depth.matrix[:2] - colour.matrix[:2] * scale[:, None]
-    return bool(np.abs(off).max() < _UNLIKE * depth.width)
 
 
 def _alike(one: Camera, other: Camera) -> bool:

@@ -53,6 +53,19 @@ COMPRESSED: Final = "/compressed"
 COMPRESSED_DEPTH: Final = "/compressedDepth"
 """After the topic of depth images that image_transport compresses."""
 
+BALLS: Final = "/robot/balls"
+"""``geometry_msgs/PoseArray``: where a robot has the balls that a camera tracks, in the robot's frame."""
+
+
+def infrared_topic(camera: str) -> str:
+    """The infrared images of a depth camera; their calibration is on ``camera_info`` beside it."""
+    return f"/{camera}/infrared/image_raw"
+
+
+def info_beside(topic: str) -> str:
+    """The calibration of the images of a topic, where drivers publish it."""
+    return f"{topic.rpartition('/')[0]}/camera_info"
+
 
 def images_of(topics: CameraTopics, compressed: str) -> tuple[str, str]:
     """The topics of colour and depth images, of which ``none``, ``colour`` or ``both`` are compressed."""

@@ -48,6 +48,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         description="Compare skeletons and joint angles in a recording with the truth: errors of position and angle "
         "as they are, and aligned in time and space as the thesis does (100 Hz, one shift, one rigid transform); "
         "delay, jitter, segment lengths, calibration, and whether the stated standard deviations hold.",
+        epilog="`body_tracking evaluate baseline` is another command: a camera's test by a robot arm or a pendulum.",
     )
     parser.add_argument("estimate", type=Path, metavar="EST", help="a bag as replay or bag_recorder writes it")
     parser.add_argument(

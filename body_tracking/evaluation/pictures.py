@@ -41,14 +41,14 @@ def draw(tracked: Tracked, path: Path) -> None:
             replace(shown[0], names=names, found=wrapped(known - true), true=np.where(np.isnan(true), true, 0))
         )
     heights = [3.6] * bool(tracked.skeletons) + [_height(each.names) for each in shown]
-    figure = _figure(0.3 + sum(heights))
+    figure = figure_of(0.3 + sum(heights))
     parts = figure.subfigures(len(heights), 1, height_ratios=heights) if len(heights) > 1 else (figure,)
     figure.suptitle(f"{tracked.bag.name}: {len(known)} frames, {tracked.duration:.1f} s; {LEGEND}", fontsize=11)
     if tracked.skeletons:
         _draw_person(parts[0], tracked, start_ns)
     for part, each in zip(parts[-len(shown) :], shown, strict=True):
         _draw_angles(part, each, _STILL if each is shown[0] else 0.0)
-    write(path, _png(figure))
+    write(path, png_of(figure))
 
 
 def are_fine(angles: AngleSeries) -> bool:
@@ -78,25 +78,25 @@ def reference_pictures(angles: AngleComparison) -> list[tuple[str, str]]:
 def _angle_picture(angles: AngleComparison) -> str:
     """``data:`` address of a picture of angles beside true ones, without those that the estimate does not state."""
     stated = np.isfinite(angles.stddev)
-    figure = _figure(_height(angles.names))
+    figure = figure_of(_height(angles.names))
     _draw_angles(figure, replace(angles, found=np.where(stated | ~stated.any(), angles.found, np.nan)))
     return _address(figure)
 
 
-def _figure(height: float) -> Any:
+def figure_of(height: float) -> Any:
     from matplotlib.figure import Figure  # slow to import, and not needed for tables
 
     return Figure(figsize=(15.0, height), dpi=100, layout="constrained")
 
 
-def _png(figure: Any) -> bytes:
+def png_of(figure: Any) -> bytes:
     data = io.BytesIO()
     figure.savefig(data, format="png")
     return data.getvalue()
 
 
 def _address(figure: Any) -> str:
-    return f"data:image/png;base64,{base64.b64encode(_png(figure)).decode()}"
+    return f"data:image/png;base64,{base64.b64encode(png_of(figure)).decode()}"
 
 
 def _thin(count: int) -> slice:
@@ -211,7 +211,7 @@ def _errors(result: Evaluation) -> str:
     after = np.repeat(np.flatnonzero(np.diff(times) > gap) + 1, 2)  # a gap, which its neighbours would fill
     edges = np.where(np.arange(len(after)) % 2, times[after] - gap / 3.0, times[after - 1] + gap / 3.0)
     distances, times = np.insert(distances, after, np.nan, axis=0), np.insert(times, after, edges)
-    figure, rows = _figure(5.0), range(len(joints))
+    figure, rows = figure_of(5.0), range(len(joints))
     axis = figure.subplots()
     highest = max(float(np.nanpercentile(distances, 99.0)), 1.0)
     colours = axis.pcolormesh(times, rows, distances.T, vmin=0.0, vmax=highest, shading="nearest")
@@ -223,7 +223,7 @@ def _errors(result: Evaluation) -> str:
 
 
 def _calibration(result: Evaluation) -> str:
-    figure = _figure(3.0)
+    figure = figure_of(3.0)
     axes = figure.subplots(1, 3)
     for number, each in enumerate(result.calibration):
         curves = (

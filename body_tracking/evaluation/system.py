@@ -10,5 +10,10 @@ SYSTEM = System(
     commands=(
         Command("show", "body_tracking.evaluation.show", "show the joint angles in a recording"),
         Command("evaluate", "body_tracking.evaluation.evaluate", "compare a recording's estimates with the truth"),
+        Command(
+            "evaluate baseline",
+            "body_tracking.evaluation.baseline",
+            "test a camera: a robot arm with red balls, or a pendulum's frequency",
+        ),
     ),
 )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from body_tracking.core.camera import Camera
 from body_tracking.core.sensor_poses import SensorPose
-from body_tracking.core.skeleton import FloatArray, IntArray, SingleArray
+from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray, SingleArray
 from body_tracking.core.sources import optical_frame
 from body_tracking.mesh.raster import render
 from body_tracking.simulation.depth_scene import DepthFrame, DepthScene
@@ -29,7 +29,7 @@ _EYE, _BROW, _MOUTH = 0.013, 0.012, 0.022
 _ON_FLOOR: Final = 0.01
 """Metres above the floor up to which a face of the room is the floor."""
 CAMERA: Final = "camera1"
-_NOISE: Final = 4.0
+NOISE: Final = 4.0
 """Standard deviation of a pixel, of 255."""
 
 
@@ -75,7 +75,7 @@ class Painter:
         heights = world[faces, 2].max(axis=1)
         background[(room.faces >= 0) & (heights[room.faces] < _ON_FLOOR)] = floor
         rng = np.random.default_rng([scene.seed, 20250101])
-        background += rng.normal(scale=_NOISE, size=background.shape)
+        background += rng.normal(scale=NOISE, size=background.shape)
         body = scene.who.body
         shown = body.materials != HAIR
         return cls(scene, camera, pose, body.faces[shown], _colours(body, rng)[shown], background, room.depth)
@@ -87,12 +87,27 @@ class Painter:
         seen = (own.depth > 0.0) & ((self.distance == 0.0) | (own.depth < self.distance))
         face = own.faces[seen]
         direction = normals(vertices, self.faces)[self.faces[face]].mean(axis=1)
-        light = _AMBIENT + (1.0 - _AMBIENT) * np.clip(direction @ (_LAMP / np.linalg.norm(_LAMP)), 0.0, 1.0)
-        picture = self.background.copy()
-        picture[seen] = self.colours[face] * light[:, None]
         rng = np.random.default_rng([self.scene.seed, round(frame.time * 1e3), 11])
-        picture[seen] += rng.normal(scale=_NOISE, size=(len(face), 3))
-        return np.clip(np.round(cv2.GaussianBlur(picture, (0, 0), 0.6)), 0.0, 255.0).astype(np.uint8)
+        return exposed(self.background, seen, self.colours[face], direction, rng)
+
+
+def exposed(
+    background: FloatArray, seen: BoolArray, colours: FloatArray, direction: FloatArray, rng: np.random.Generator
+) -> NDArray[np.uint8]:
+    """(height, width, 3) red, green, blue of lit surfaces before a background, with noise and blur.
+
+    Args:
+        background: (height, width, 3), whose noise is in it.
+        seen: (height, width) the n pixels of the surfaces.
+        colours: (n, 3) of them.
+        direction: (n, 3) their normals in the optical frame.
+        rng: of their noise.
+    """
+    light = _AMBIENT + (1.0 - _AMBIENT) * np.clip(direction @ (_LAMP / np.linalg.norm(_LAMP)), 0.0, 1.0)
+    picture = background.copy()
+    picture[seen] = colours * light[:, None]
+    picture[seen] += rng.normal(scale=NOISE, size=(len(colours), 3))
+    return np.clip(np.round(cv2.GaussianBlur(picture, (0, 0), 0.6)), 0.0, 255.0).astype(np.uint8)
 
 
 def _colours(body: Body, rng: np.random.Generator) -> FloatArray:

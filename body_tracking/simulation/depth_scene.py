@@ -145,22 +145,22 @@ class DepthScene:
         The faces are small, as lens distortion bends their edges.
         """
         quads = [
-            _quad((0.4, -4.0, 0.0), (_WALL - 0.4, 0.0, 0.0), (0.0, 8.0, 0.0)),
-            _quad((_WALL, -4.0, 0.0), (0.0, 8.0, 0.0), (0.0, 0.0, 3.5)),
+            quad((0.4, -4.0, 0.0), (_WALL - 0.4, 0.0, 0.0), (0.0, 8.0, 0.0)),
+            quad((_WALL, -4.0, 0.0), (0.0, 8.0, 0.0), (0.0, 0.0, 3.5)),
         ]
         if self.table:
             (left, right), (near, far), height = _TABLE
             wide, thick, leg = right - left, 0.08, 0.05
-            quads.append(_quad((near, left, height), (far - near, 0.0, 0.0), (0.0, wide, 0.0)))
-            quads.append(_quad((near, left, height - thick), (0.0, wide, 0.0), (0.0, 0.0, thick)))
-            quads += [_quad((near, y, 0.0), (0.0, leg, 0.0), (0.0, 0.0, height)) for y in (left, right - leg)]
+            quads.append(quad((near, left, height), (far - near, 0.0, 0.0), (0.0, wide, 0.0)))
+            quads.append(quad((near, left, height - thick), (0.0, wide, 0.0), (0.0, 0.0, thick)))
+            quads += [quad((near, y, 0.0), (0.0, leg, 0.0), (0.0, 0.0, height)) for y in (left, right - leg)]
         starts = np.cumsum([0, *(len(points) for points, _ in quads[:-1])])
         faces = [each + start for (_, each), start in zip(quads, starts, strict=True)]
         points = np.concatenate([points for points, _ in quads])
         return (points - self.pose.translation) @ self.pose.rotation, np.concatenate(faces).astype(np.int32)
 
 
-def _quad(
+def quad(
     corner: tuple[float, float, float], one: tuple[float, float, float], other: tuple[float, float, float]
 ) -> tuple[FloatArray, NDArray[np.int32]]:
     """A parallelogram by a corner and two sides, in faces of a decimetre."""

@@ -14,6 +14,11 @@ SYSTEM = System(
             "simulate people in front of sensors, as a bag with the ground truth",
         ),
         Command(
+            "simulate baseline",
+            "body_tracking.simulation.baseline_bags",
+            "simulate recordings for `evaluate baseline`",
+        ),
+        Command(
             "make-bags", "body_tracking.simulation.bags", "make the simulated recordings that are shipped in bags/"
         ),
     ),

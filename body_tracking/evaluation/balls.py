@@ -1,0 +1,151 @@
+"""Balls in images for the baseline tests: red ones in colour and depth, retro-reflective ones in infrared.
+
+Schlagenhauf 2017, section 4.1.1: a filter of red, a binary image, detection of circles, and the depth at the centroid
+(figure 4.4). A retro-reflective ball (section 4.1.2) sends back so much of the camera's own light that a time-of-flight
+camera measures no depth there, which tells it from other bright things.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from body_tracking.core.camera import Camera
+from body_tracking.core.skeleton import FloatArray, SingleArray
+from body_tracking.markers.detection import detect
+from body_tracking.markers.spheres import sphere_centre_correction
+
+_HUE: Final = 8
+"""Largest distance of a red pixel's hue from red, of OpenCV's 180 steps of the circle."""
+_SATURATION, _VALUE = 110, 40
+"""Least of a red pixel, of 255: also where the ball is in its own shade. Chosen on rendered images."""
+_LEAST_AREA: Final = 20.0
+"""Pixels of a red region that is looked at."""
+_ROUND: Final = 0.8
+"""Least share of its smallest enclosing circle that a round region fills; an ellipse fills the ratio of its axes."""
+_SIZES: Final = (0.7, 1.4)
+"""Ratio of a ball's measured radius to its true one."""
+_INNER: Final = 0.6
+"""Share of the ball's radius around its middle in which depth is taken: flying pixels and holes are at its outline."""
+_LEAST_DEPTHS: Final = 6
+"""Pixels with depth that a ball needs."""
+_LARGEST_HOLE: Final = 0.5
+"""Share of a retro-reflective ball's pixels that may have depth."""
+
+
+class RedBalls(NamedTuple):
+    """The red balls in an image.
+
+    Attributes:
+        centres: (k, 3) metres, in the camera's optical frame.
+        without_depth: number of round red regions without depth.
+    """
+
+    centres: FloatArray
+    without_depth: int
+
+
+def red_balls(image: NDArray[np.uint8], depth: SingleArray, colour: Camera, view: Camera, radius: float) -> RedBalls:
+    """Centres of red balls (Schlagenhauf 2017, section 4.1.1; figure 4.4): the median depth plus the radius.
+
+    The radius is added along the ray through the middle, pixel by pixel: each pixel with depth gives the distance at
+    which a sphere around that ray would pass through its point. The median is over the pixels near the middle.
+
+    Args:
+        image: (height, width, 3) red, green, blue.
+        depth: metres, 0 where missing, registered to the colour image; any size.
+        colour: intrinsics of the colour image.
+        view: intrinsics of the depth image, with the same optical centre.
+        radius: of the balls, metres.
+    """
+    hsv = cv2.cvtColor(image, cv2.COLOR_RGB2HSV)
+    low, high = (0, _SATURATION, _VALUE), (179, 255, 255)
+    red = cv2.bitwise_or(cv2.inRange(hsv, low, (_HUE, 255, 255)), cv2.inRange(hsv, (179 - _HUE, *low[1:]), high))
+    outlines, _ = cv2.findContours(red, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    focal = float(np.sqrt(colour.matrix[0, 0] * colour.matrix[1, 1]))
+    centres, without_depth = [], 0
+    for outline in outlines:
+        moments = cv2.moments(outline)
+        # the outline goes through pixels' centres: by Pick's theorem these are the pixels on and in it
+        area = moments["m00"] + 0.5 * len(outline) + 1.0
+        if area < _LEAST_AREA or not moments["m00"] > 0.0:
+            continue
+        _, reach = cv2.minEnclosingCircle(outline)
+        if area < _ROUND * np.pi * (reach + 0.5) ** 2:
+            continue
+        middle = np.array([moments["m10"], moments["m01"]]) / moments["m00"]
+        size = float(np.sqrt(area / np.pi)) / focal
+        distance = _distance(depth, view, _ray(colour, middle), size, radius)
+        if distance is None:
+            without_depth += 1
+            continue
+        along = float(distance * _ray(colour, middle)[2])
+        if _SIZES[0] * radius < size * along < _SIZES[1] * radius:
+            shift = sphere_centre_correction(colour, middle[None], np.array([along]), radius)[0]
+            centres.append(distance * _ray(colour, middle + shift))
+    return RedBalls(np.array(centres).reshape(-1, 3), without_depth)
+
+
+def _ray(camera: Camera, pixel: FloatArray) -> FloatArray:
+    """(3,) unit vector through a pixel (2,)."""
+    ray = np.append(camera.undistort(pixel), 1.0)
+    return np.asarray(ray / np.linalg.norm(ray))
+
+
+def _distance(depth: SingleArray, view: Camera, ray: FloatArray, size: float, radius: float) -> float | None:
+    """Metres along a ray to the centre of a ball of a size in radians; None without enough depth on it."""
+    middle = view.project(ray)
+    reach = size * float(view.matrix[0, 0])
+    rows, columns = np.mgrid[
+        max(0, round(middle[1] - reach)) : max(0, round(middle[1] + reach) + 1),
+        max(0, round(middle[0] - reach)) : max(0, round(middle[0] + reach) + 1),
+    ].reshape(2, -1)
+    inside = (rows < depth.shape[0]) & (columns < depth.shape[1])
+    rows, columns = rows[inside], columns[inside]
+    near = (columns - middle[0]) ** 2 + (rows - middle[1]) ** 2 <= (_INNER * reach) ** 2
+    near &= depth[rows, columns] > 0.0
+    if np.count_nonzero(near) < _LEAST_DEPTHS:
+        return None
+    flat = view.undistort(np.column_stack([columns[near], rows[near]]).astype(np.float64))
+    points = depth[rows[near], columns[near], None] * np.column_stack([flat, np.ones(len(flat))])
+    passed = points @ ray
+    aside = (points**2).sum(axis=1) - passed**2
+    return float(np.nanmedian(passed + np.sqrt(np.maximum(radius**2 - aside, 0.0))))
+
+
+class BrightBalls(NamedTuple):
+    """Bright balls in an infrared image.
+
+    Attributes:
+        pixels: (k, 2) centroids of those without depth.
+        radii: (k,) pixels.
+        with_depth: number of those with depth, which are not retro-reflective.
+    """
+
+    pixels: FloatArray
+    radii: FloatArray
+    with_depth: int
+
+
+def bright_balls(infrared: NDArray[Any], depth: SingleArray) -> BrightBalls:
+    """Retro-reflective balls (Schlagenhauf 2017, section 4.1.2; figure 4.9): bright, and without depth.
+
+    Args:
+        infrared: (height, width) brightness of 8 or 16 bits.
+        depth: (height, width) metres of the same camera, 0 where missing.
+    """
+    found = detect(infrared)
+    radii = np.sqrt(found.areas / np.pi)
+    rows, columns = np.indices(depth.shape)
+    kept = []
+    for pixel, radius in zip(found.pixels, radii, strict=True):
+        reach = int(np.ceil(radius))
+        left, top = (max(int(place) - reach, 0) for place in pixel)
+        part = slice(top, top + 2 * reach + 2), slice(left, left + 2 * reach + 2)
+        disc = (columns[part] - pixel[0]) ** 2 + (rows[part] - pixel[1]) ** 2 <= radius**2
+        kept.append(bool((depth[part][disc] > 0.0).mean() < _LARGEST_HOLE) if disc.any() else False)
+    retro = np.array(kept, dtype=np.bool_)
+    return BrightBalls(found.pixels[retro], radii[retro], int(np.count_nonzero(~retro)))

@@ -1,0 +1,304 @@
+"""The frequency of a pendulum by what a sensor sees of it (Schlagenhauf 2017, section 4.1.2; figures 4.9-4.10).
+
+She compares measured with theoretical frequencies and does not say how she measures them. Here a damped oscillation is
+fitted to the signal at its true stamps, so that lost and irregular frames do no harm. The period of a pendulum grows
+with its amplitude, by 0.4 % at 15 degrees, so the fitted frequency is that of small amplitudes, which the length
+gives: sqrt(g / L) / (2 pi).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.signal import find_peaks, lombscargle
+
+from body_tracking.core.csv_file import CsvFile
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.imu import STANDARD_GRAVITY
+from body_tracking.core.skeleton import FloatArray
+
+Signal = Literal["sine", "angle", "rate"]
+"""Of the pendulum's angle to the vertical: its sine, which is the ball's displacement as a share of the length; the
+angle, radians; and its rate, radians per second."""
+SLOWEST, FASTEST = 0.1, 5.0
+"""Hz between which the frequency is searched: pendulums of 25 m and of 10 mm."""
+_PERIODS: Final = 3.0
+"""Least number of periods in a signal."""
+_LEAST: Final = 20
+"""Least number of samples."""
+_ROUNDS: Final = 5
+"""Fits of the arc, each without the outliers of the one before."""
+_OUTLIER: Final = 4.0
+"""Standard deviations from which on a point is no point of the arc."""
+_NORMAL_MAD: Final = 1.4826
+"""Standard deviation of a normal distribution in median absolute deviations."""
+
+
+class PendulumError(BodyTrackingError):
+    """A signal is not that of a swinging pendulum, or its file cannot be used."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Swing:
+    """A fitted oscillation.
+
+    Attributes:
+        frequency: Hz, for small amplitudes and without damping.
+        stddev: of the frequency by the scatter of the signal, Hz.
+        amplitude: radians, at the first sample.
+        damping: 1/s, of the amplitude.
+        residual: root mean square of the signal's residual, in its unit.
+        fitted: (n,) the oscillation at the times of the samples, in the signal's unit.
+    """
+
+    frequency: float
+    stddev: float
+    amplitude: float
+    damping: float
+    residual: float
+    fitted: FloatArray
+
+
+def natural_frequency(length: float, gravity: float = STANDARD_GRAVITY) -> float:
+    """Hz of a point on a string of a length in metres, for small amplitudes."""
+    return float(np.sqrt(gravity / length) / (2.0 * np.pi))
+
+
+def oscillation(times: FloatArray, parameters: FloatArray, signal: Signal) -> tuple[FloatArray, float]:
+    """The signal at (n,) s after the start, and the amplitude there, radians.
+
+    The phase advances by the angular frequency at the amplitude theta of the time: omega (1 - theta^2 / 16 +
+    theta^4 / 3072), the inverse of the series of the period, 1 + theta^2 / 16 + 11 theta^4 / 3072. The test compares
+    it with integrated equations of motion.
+
+    Args:
+        times: (n,) s.
+        parameters: (5,) angular frequency rad/s, damping 1/s, amplitudes of cosine and minus sine at the start, offset.
+        signal: which one.
+    """
+    omega, damping, cosine, sine, offset = parameters
+    amplitude = np.hypot(cosine, sine)
+    if signal == "rate":
+        theta = amplitude / omega
+    elif signal == "angle":
+        theta = amplitude
+    else:
+        # the first harmonic of sin(theta cos(phase)) is 2 J1(theta) = theta - theta^3 / 8
+        share = min(float(amplitude), 1.0)
+        theta = share + share**3 / 8.0
+    mean_square, mean_fourth = (theta**power * _decayed(power * damping, times) for power in (2, 4))
+    phase = np.sqrt(np.maximum(omega**2 - damping**2, 0.0)) * (times - mean_square / 16.0 + mean_fourth / 3072.0)
+    turned = np.exp(-damping * times) * (cosine * np.cos(phase) - sine * np.sin(phase))
+    return np.asarray(offset + turned), float(theta)
+
+
+def _decayed(rate: float, times: FloatArray) -> FloatArray:
+    """The integral of exp(-rate t) from 0 to (n,) s."""
+    return times if abs(rate) < 1e-9 else np.asarray(-np.expm1(-rate * times) / rate)
+
+
+def fit_swing(times: FloatArray, values: FloatArray, signal: Signal) -> Swing:
+    """Fit a damped oscillation, robustly against single outliers (Schlagenhauf 2017, section 4.1.2; figure 4.10).
+
+    Args:
+        times: (n,) s, the capture times; any steps.
+        values: (n,) the signal.
+        signal: which one it is, which tells the amplitude as an angle.
+
+    Raises:
+        PendulumError: too few samples or periods, or nothing that swings.
+    """
+    known = np.isfinite(values)
+    if np.count_nonzero(known) < _LEAST:
+        raise PendulumError(f"{np.count_nonzero(known)} samples of the pendulum, at least {_LEAST} are needed")
+    start = float(times[known][0])
+    at, seen = times[known] - start, values[known]
+    span = float(at[-1])
+    centred = seen - seen.mean()
+    if not (span * FASTEST > _PERIODS and centred.std() > 0.0):
+        raise PendulumError(f"a signal of {span:.2f} s that {'stands still' if span else 'has one time'}")
+    grid = np.arange(max(SLOWEST, 1.0 / span), FASTEST, 0.2 / span)
+    omega = 2.0 * np.pi * float(grid[np.argmax(lombscargle(at, centred, 2.0 * np.pi * grid))])
+    design = np.column_stack([np.cos(omega * at), -np.sin(omega * at), np.ones_like(at)])
+    linear = np.linalg.lstsq(design, seen, rcond=None)[0]
+    begin = np.array([omega, 0.0, *linear])
+    size = float(np.hypot(linear[0], linear[1])) or 1.0
+    scale = np.array([1.0 / span, 1.0 / span, size, size, size])
+
+    def residuals(parameters: FloatArray) -> FloatArray:
+        return oscillation(at, parameters, signal)[0] - seen
+
+    def spread(residual: FloatArray) -> float:
+        return max(_NORMAL_MAD * float(np.median(np.abs(residual))), 1e-9 * size)
+
+    low = np.array([2.0 * np.pi * 0.5 * SLOWEST, -5.0 / span, *(-np.inf,) * 3])
+    bounds = low, np.array([4.0 * np.pi * FASTEST, 50.0 / span, *(np.inf,) * 3])
+    for _ in range(2):
+        # the second time with a scale of outliers that the decay does not widen
+        found = least_squares(
+            *(residuals, begin), bounds=bounds, x_scale=scale, loss="soft_l1", f_scale=spread(residuals(begin))
+        )
+        begin = found.x
+    residual = residuals(found.x)
+    fitted, theta = oscillation(at, found.x, signal)
+    noise = spread(residual)
+    frequency = float(found.x[0] / (2.0 * np.pi))
+    if frequency * span < _PERIODS:
+        raise PendulumError(f"{frequency * span:.1f} periods of the pendulum, at least {_PERIODS:.0f} are needed")
+    if not np.ptp(fitted) > 2.0 * noise:
+        raise PendulumError("nothing swings: no oscillation stands out of the scatter of the positions")
+    covariance = noise**2 * np.linalg.pinv(found.jac.T @ found.jac)
+    whole = np.full(len(times), np.nan)
+    whole[known] = fitted
+    return Swing(
+        frequency,
+        float(np.sqrt(covariance[0, 0]) / (2.0 * np.pi)),
+        theta,
+        float(found.x[1]),
+        float(np.sqrt((residual**2).mean())),
+        whole,
+    )
+
+
+def along(points: FloatArray) -> FloatArray:
+    """(n, d) components of (n, d) points about their median along their principal axes, the longest first.
+
+    NaN where unknown.
+    """
+    known = np.isfinite(points).all(axis=1)
+    if not known.any():
+        return np.full(points.shape, np.nan)
+    centred = points - np.median(points[known], axis=0)
+    _, vectors = np.linalg.eigh(centred[known].T @ centred[known])
+    return np.asarray(centred @ vectors[:, ::-1])
+
+
+def sines(points: FloatArray) -> FloatArray:
+    """(n,) sines of the pendulum's angle by the arc that its ball makes in the image, up to a constant.
+
+    The ball is at R (sin, 1 - cos) of the angle. How it rises towards the ends of the arc gives R in the image, so that
+    neither the camera's distance nor the length is needed. The swing is taken to be across the view.
+
+    Args:
+        points: (n, 2) ideal image coordinates x/z and y/z, without distortion; NaN where unknown.
+    """
+    u, v = along(points).T
+    known = np.isfinite(u)
+    inside, curvature = known.copy(), 0.0
+    for _ in range(_ROUNDS):
+        # the arc over c: (1 - sqrt(1 - c^2 u^2)) / c = c u^2 / (1 + sqrt(1 - c^2 u^2))
+        rise = u**2 / (1.0 + np.sqrt(np.maximum(1.0 - (curvature * u) ** 2, 0.0)))
+        design = np.column_stack([np.ones_like(u), u, rise])
+        line = np.linalg.lstsq(design[inside], v[inside], rcond=None)[0]
+        curvature = abs(float(line[2]))
+        residual = np.abs(design @ line - v)
+        inside = known & (residual <= _OUTLIER * _NORMAL_MAD * np.median(residual[known]))
+    return np.asarray(curvature * u)
+
+
+# --- the pendulum with Vicon of Szczesna et al. (2016)
+
+_HEADER: Final = "Time;Vicon Orientation;"
+_WIDTH: Final = 14
+_LARGEST, _SMALLEST = np.radians([20.0, 2.0])
+"""Amplitudes between which a decay counts: three links swing together once the higher modes have died away."""
+_SWINGS: Final = 7
+"""Half periods of a decay, at least."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Decay:
+    """A pendulum that was let go: what Vicon and an inertial sensor on it measured.
+
+    Attributes:
+        start: s, of the file's time.
+        vicon: fitted to the angle of its orientation.
+        gyroscope: fitted to the rate about the same axis.
+    """
+
+    start: float
+    vicon: Swing
+    gyroscope: Swing
+
+
+def is_vicon_pendulum(path: Path) -> bool:
+    """Whether a ``.csv`` or ``.csv.gz`` file is of the data set's layout.
+
+    Raises:
+        CsvError: the file cannot be read.
+    """
+    return next(CsvFile(path).lines(), "").startswith(_HEADER)
+
+
+def vicon_decays(path: Path) -> list[Decay]:
+    """The decays of a link of the pendulum (RepoIMU; Szczesna et al. 2016), a row after each release.
+
+    The angle is that about the axis of most movement. Rows that repeat a reading of the gyroscope are left out.
+
+    Raises:
+        CsvError: the file cannot be read.
+        PendulumError: another layout, or no decay in it.
+    """
+    if not is_vicon_pendulum(path):
+        raise PendulumError(f"{path}: the header is not that of Szczesna et al. (2016), {_HEADER!r}...")
+    try:
+        rows = np.array([[_number(cell) for cell in line.split(";")] for line in [*CsvFile(path).lines()][2:]])
+    except ValueError as error:
+        raise PendulumError(f"{path}: {error}") from error
+    if rows.ndim != 2 or rows.shape[1] != _WIDTH:
+        raise PendulumError(f"{path}: not {_WIDTH} columns in all rows")
+    times, quats, rates = rows[:, 0], rows[:, 1:5], rows[:, 8:11]
+    sound = np.abs(np.linalg.norm(quats, axis=1) - 1.0) < 0.01
+    # small angles about one axis: twice the vector part, of the half in which w is positive
+    vectors = 2.0 * np.arcsin(np.clip(quats[:, 1:] * np.sign(quats[:, :1]), -1.0, 1.0))
+    angle = along(np.where(sound[:, None], vectors, np.nan))[:, 0]
+    moved = np.concatenate([[True], (np.diff(rates, axis=0) != 0.0).any(axis=1)])
+    rate = along(np.where(moved[:, None], rates, np.nan))[:, 0]
+    found = []
+    for first, last in _decays(times, angle):
+        part = slice(first, last + 1)
+        found.append(
+            Decay(
+                float(times[first]),
+                fit_swing(times[part], angle[part], "angle"),
+                fit_swing(times[part], rate[part], "rate"),
+            )
+        )
+    if not found:
+        raise PendulumError(f"{path}: the pendulum never swings out freely from {np.degrees(_LARGEST):.0f} degrees")
+    return found
+
+
+def _number(cell: str) -> float:
+    """A cell; the files have some commas for points."""
+    return float(cell.replace(",", ".") or "nan")
+
+
+def _decays(times: FloatArray, angle: FloatArray) -> list[tuple[int, int]]:
+    """First and last row of each run of extrema of either sign that only become smaller."""
+    filled = np.interp(times, times[np.isfinite(angle)], angle[np.isfinite(angle)])
+    step = float(np.median(np.diff(times)))
+    apart = max(1, round(0.25 / step))
+    peaks = np.sort(
+        np.concatenate(
+            # prominence: a higher mode makes no extremum of its own
+            [
+                find_peaks(sign * filled, height=_SMALLEST, distance=apart, prominence=2.0 * _SMALLEST)[0]
+                for sign in (1, -1)
+            ]
+        )
+    )
+    runs: list[list[int]] = []
+    before = 0.0
+    for peak in peaks:
+        height = abs(filled[peak])
+        if not (height <= abs(before) and filled[peak] * before < 0.0):
+            runs.append([])
+        before = float(filled[peak])
+        if height <= _LARGEST:
+            runs[-1].append(int(peak))
+    return [(run[0], run[-1]) for run in runs if len(run) > _SWINGS]
