@@ -139,13 +139,14 @@ def bright_balls(infrared: NDArray[Any], depth: SingleArray) -> BrightBalls:
     """
     found = detect(infrared)
     radii = np.sqrt(found.areas / np.pi)
-    rows, columns = np.indices(depth.shape)
+    rows, columns = (np.arange(size) for size in depth.shape)
     kept = []
     for pixel, radius in zip(found.pixels, radii, strict=True):
         reach = int(np.ceil(radius))
         left, top = (max(int(place) - reach, 0) for place in pixel)
-        part = slice(top, top + 2 * reach + 2), slice(left, left + 2 * reach + 2)
-        disc = (columns[part] - pixel[0]) ** 2 + (rows[part] - pixel[1]) ** 2 <= radius**2
-        kept.append(bool((depth[part][disc] > 0.0).mean() < _LARGEST_HOLE) if disc.any() else False)
+        down, across = slice(top, top + 2 * reach + 2), slice(left, left + 2 * reach + 2)
+        part = depth[down, across]
+        disc = (columns[across] - pixel[0]) ** 2 + (rows[down, None] - pixel[1]) ** 2 <= radius**2
+        kept.append(bool((part[disc] > 0.0).mean() < _LARGEST_HOLE) if disc.any() else False)
     retro = np.array(kept, dtype=np.bool_)
     return BrightBalls(found.pixels[retro], radii[retro], int(np.count_nonzero(~retro)))

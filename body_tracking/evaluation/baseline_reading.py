@@ -188,7 +188,8 @@ def _robot(bag: RigReader, path: Path, topic: str) -> tuple[FloatArray, FloatArr
         raise EvaluationError(f"{path}: nothing on {topic}, on which the robot states where its balls are")
     if bag.topics[topic].type_name != POSE_ARRAY:
         raise EvaluationError(f"{path}: {topic} is of type {bag.topics[topic].type_name}, expected {POSE_ARRAY}")
-    times, places = [], []
+    times: list[float] = []
+    places: list[FloatArray] = []
     for raw in bag.messages([topic]):
         try:
             stamp_ns, points = pose_array_to_points(deserialize(POSE_ARRAY, raw.cdr))
