@@ -13,7 +13,7 @@ from launch_ros.actions import Node
 from body_tracking import systems
 from body_tracking.core.parameters import Value, to_ros
 from body_tracking.pipeline.system import NodeSpec, Option
-from body_tracking.ros.up import CANNOT_START, UpError, all_parameters, arguments_from, options_for
+from body_tracking.ros.up import CANNOT_START, STOP_TIMEOUT, UpError, all_parameters, arguments_from, options_for
 
 OPTIONS = [option for option in systems.OPTIONS.values() if not option.hidden]
 TRUTH = {"true": True, "1": True, "false": False, "0": False}
@@ -55,6 +55,8 @@ def action(spec: NodeSpec, parameters: dict[str, Value]) -> Node:
         # The bag player ends with its bag.
         respawn=spec.executable != "bag_player",
         respawn_delay=0.5,
+        # launch's own 5 s are too few on a busy machine: a recorder may still write, the middleware waits for others
+        sigterm_timeout=str(STOP_TIMEOUT),
     )
 
 

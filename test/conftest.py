@@ -33,15 +33,22 @@ PROCESSES = (
     *("test_package.py", "test_up.py"),
 )
 
-LONGEST = (
-    "works[README]",
-    "test_live_equals_offline.py",
-    "test_fifth_system.py",
-    "ros2/",
-    "test_up.py",
-    "test_robot_safety.py",
-)
-"""Of these, so that none of them is left over at the end."""
+ONE_AT_A_TIME = {
+    "ros2": ("ros2/",),
+    "graphs": (
+        "works[README]",
+        "test_live_equals_offline.py",
+        "test_fifth_system.py",
+        "test_up.py",
+        "test_robot_safety.py",
+    ),
+}
+"""Tests that start a dozen processes each, of which one of each kind runs at a time, before all others: several would
+starve each other while their nodes start."""
+
+
+def _heavy(nodeid: str) -> str | None:
+    return next((kind for kind, names in ONE_AT_A_TIME.items() if any(name in nodeid for name in names)), None)
 
 
 def _starts_processes(path: Path) -> bool:
@@ -67,7 +74,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests that start processes, which run in a phase of their own, those that take longest first."""
-    items.sort(key=lambda item: not any(each in item.nodeid for each in LONGEST))
+    items.sort(key=lambda item: _heavy(item.nodeid) is None)
     for item in items:
         if _starts_processes(item.path):
             item.add_marker(pytest.mark.processes)
@@ -76,10 +83,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 class SharedNodes(LoadScopeScheduling):
-    """Tests that share a module's running nodes stay together and in order on one worker, all others go anywhere."""
+    """Tests that share a module's running nodes, or are heavy, stay in order on one worker; all others go anywhere."""
 
     def _split_scope(self, nodeid: str) -> str:
         file = nodeid.partition("::")[0]
+        if heavy := _heavy(nodeid):
+            return heavy
         return file if 'scope="module"' in (ROOT / file).read_text(encoding="utf-8") else nodeid
 
 
