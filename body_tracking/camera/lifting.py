@@ -190,11 +190,16 @@ def is_flat(found: Landmarks, depth: SingleArray, camera: Camera) -> bool:
 
 
 def _trunk_mask(found: Landmarks, shape: tuple[int, ...]) -> BoolArray:
-    """Pixels of the trunk: between shoulders and hips, and about the spine where it is seen from the side."""
+    """Pixels of the trunk: between shoulders and hips, and about the spine where it is seen from the side.
+
+    None where a corner is unknown.
+    """
     corners = found.pixels[_TORSO]
+    mask = np.zeros(shape, np.uint8)
+    if not np.isfinite(corners).all():
+        return mask.astype(np.bool_)
     middle = corners.mean(axis=0)
     top, bottom = corners[:2].mean(axis=0), corners[2:].mean(axis=0)
-    mask = np.zeros(shape, np.uint8)
     inner = np.round(middle + 0.8 * (corners - middle)).astype(np.int32)
     cv2.fillConvexPoly(mask, cv2.convexHull(inner), 1)
     ends = [tuple(np.round(middle + 0.7 * (end - middle)).astype(int).tolist()) for end in (top, bottom)]

@@ -132,3 +132,16 @@ def test_a_picture_of_a_person_is_flat_and_a_person_is_not(slope: float) -> None
     poster += np.random.default_rng(0).normal(scale=0.003, size=poster.shape)
     assert is_flat(found, poster.astype(np.float32), CAMERA)
     assert not is_flat(found, depth, CAMERA)
+
+
+@pytest.mark.parametrize("corner", ["SHOULDER_LEFT", "HIP_RIGHT"])
+def test_a_trunk_with_an_unknown_corner_has_no_depth(corner: str) -> None:
+    """The lens model of a camera has no inverse far outside of the image: such landmarks have no pixels."""
+    found, depth = person()
+    pixels = found.pixels.copy()
+    pixels[Landmark[corner]] = np.nan
+    unknown = replace(found, pixels=pixels)
+    assert trunk_depth(unknown, depth) is None
+    assert lift(unknown, depth, CAMERA) is None
+    # the other landmarks are too few points to say
+    assert not is_flat(unknown, depth, CAMERA)
