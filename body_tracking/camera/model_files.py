@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import subprocess
 import sys
@@ -17,6 +18,11 @@ FOLDER_VARIABLE: Final = "BODY_TRACKING_POSE_MODEL"
 """Environment variable with the folder of the networks."""
 _WHEEL: Final = "mediapipe==0.10.21"
 """The last release of MediaPipe with the networks inside."""
+_DIGESTS: Final = {
+    DETECTOR_FILE: "9ba9dd3d42efaaba86b4ff0122b06f29c4122e756b329d89dca1e297fd8f866c",
+    LANDMARKS_FILE: "e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f",
+}
+"""SHA-256 of the networks in it."""
 _BUILT_FOR: Final = ("--python-version", "3.12", "--platform", "manylinux_2_28_x86_64")
 """One of its wheels; the networks are the same in all of them."""
 _LARGEST: Final = 64 << 20
@@ -27,6 +33,16 @@ def default_folder() -> Path:
     """The folder of :data:`FOLDER_VARIABLE`, else one in the user's cache (XDG base directories)."""
     given = os.environ.get(FOLDER_VARIABLE)
     return Path(given).expanduser() if given else user_cache() / "pose_model"
+
+
+def are_whole(folder: Path) -> bool:
+    """Whether a folder has the networks, complete and of the release that :func:`fetch` downloads."""
+    try:
+        return all(
+            hashlib.sha256((folder / name).read_bytes()).hexdigest() == digest for name, digest in _DIGESTS.items()
+        )
+    except OSError:
+        return False
 
 
 def fetch(folder: Path) -> None:

@@ -40,7 +40,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """``body_tracking camera``."""
     command = subparsers.add_parser("camera", description=__doc__)
     actions = command.add_subparsers(metavar="ACTION", required=True)
-    model = actions.add_parser("model", help="fetch the networks (MediaPipe's, Apache licence 2.0; 35 MB by pip)")
+    model = actions.add_parser(
+        "model", help="fetch the networks, if they are not there (MediaPipe's, Apache licence 2.0; 35 MB by pip)"
+    )
     model.add_argument("folder", type=Path, nargs="?", help="where to (default: the user's cache)")
     model.set_defaults(run=_model)
     show = actions.add_parser("show", help="draw the people in an image")
@@ -53,8 +55,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def _model(args: argparse.Namespace) -> int:
     folder = args.folder or model_files.default_folder()
-    print("fetching MediaPipe's networks by pip (35 MB)")
-    model_files.fetch(folder)
+    if not model_files.are_whole(folder):
+        print("fetching MediaPipe's networks by pip (35 MB)")
+        model_files.fetch(folder)
     print(f"networks: {folder}")
     return 0
 
