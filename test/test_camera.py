@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -38,6 +40,15 @@ def test_a_ray_through_a_pixel_is_projected_onto_it_from_any_distance(model: str
     for distance in (0.5, 3.0):
         np.testing.assert_allclose(lens.project(distance * rays), grid(), atol=1e-8)
     assert lens.contains(grid()).all() and not lens.contains(np.array([[-1.0, 3.0], [512.0, 3.0], [3.0, 424.0]])).any()
+
+
+@pytest.mark.parametrize(
+    "change", [{"width": 640}, {"matrix": MATRIX + np.diag([1.0, 0.0, 0.0])}, {"distortion": np.zeros(5)}]
+)
+def test_a_calibration_is_like_another_one_with_the_same_numbers_alone(change: dict[str, object]) -> None:
+    assert camera().is_like(replace(camera(), frame_id="other_optical_frame"))
+    assert not camera().is_like(replace(camera(), **change))  # type: ignore[arg-type]
+    assert not camera().is_like(camera("rational_polynomial"))
 
 
 @pytest.mark.parametrize("model", LENSES)

@@ -236,7 +236,7 @@ class ColourAndDepth:
             CameraError: the depth images are not registered to the colour images.
         """
         known = self._infos.get(what)
-        if known is not None and _alike(known, camera):
+        if known is not None and known.is_like(camera):
             return
         self._infos[what] = camera
         self._registration = None
@@ -351,9 +351,3 @@ def _pose(numbers: tuple[str, ...]) -> SensorPose | None:
     if values.shape != (7,) or not np.isfinite(values).all() or not np.linalg.norm(values[3:]) > 0.5:
         raise graph.GraphError(f"depth_pose: {', '.join(numbers)}; expected x, y, z and a unit quaternion x, y, z, w")
     return SensorPose(_DEPTH, values[:3], values[3:])
-
-
-def _alike(one: Camera, other: Camera) -> bool:
-    """Whether two calibrations are the same, as a driver sends one with each image."""
-    same = (one.width, one.height, one.model) == (other.width, other.height, other.model)
-    return same and np.array_equal(one.matrix, other.matrix) and np.array_equal(one.distortion, other.distortion)

@@ -72,6 +72,11 @@ class Camera:
                 f"{where}: matrix {self.matrix.tolist()}, expected [fx 0 cx; 0 fy cy; 0 0 1]; calibrated?"
             )
 
+    def is_like(self, other: Camera) -> bool:
+        """Whether another calibration is the same, whatever its frame is called: drivers send one with each image."""
+        same = (self.width, self.height, self.model) == (other.width, other.height, other.model)
+        return same and np.array_equal(self.matrix, other.matrix) and np.array_equal(self.distortion, other.distortion)
+
     def project(self, points: FloatArray) -> FloatArray:
         """Pixels (..., 2) of points (..., 3) in the camera's frame, metres; NaN for points that are not in front."""
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -282,7 +282,7 @@ class DepthSensor:
     def calibrate(self, camera: Camera) -> None:
         """Take the intrinsics; the person is looked for anew where they have changed."""
         if self._tracker is not None:
-            if _alike(self._tracker.camera, camera):
+            if self._tracker.camera.is_like(camera):
                 return
             self._counters["calibrations that differ from the last one"] += 1
         self._tracker = MeshTracker(
@@ -385,9 +385,3 @@ class DepthSensor:
     def save_to(self, file: Path) -> None:
         """Write the shape of the body; errors as of :meth:`save`."""
         storage.save(file, self.body.shape, self._covariance)
-
-
-def _alike(one: Camera, other: Camera) -> bool:
-    """Whether two calibrations are the same, as a driver sends one with each image."""
-    same = (one.width, one.height, one.model) == (other.width, other.height, other.model)
-    return same and np.array_equal(one.matrix, other.matrix) and np.array_equal(one.distortion, other.distortion)
