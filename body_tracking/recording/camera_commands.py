@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from body_tracking.camera import model_files
-from body_tracking.camera.picture import draw
+from body_tracking.camera.pictures import draw
 from body_tracking.camera.pose_model import Landmarks, PoseModel
 from body_tracking.core.errors import BodyTrackingError
 
