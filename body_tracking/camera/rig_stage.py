@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from body_tracking.camera.codecs import ColourImage, CompressedColour
-from body_tracking.camera.model_files import default_folder
 from body_tracking.camera.numbers import PersonNumbers
-from body_tracking.camera.people import PersonTracker
 from body_tracking.camera.pictures import RATE, Pictures
-from body_tracking.camera.pose_model import ImageArray, Landmarks, PoseModel
-from body_tracking.camera.stage import DRIVER, MODEL, PEOPLE, SEARCH, THREADS
+from body_tracking.camera.pose_model import ImageArray, Landmarks
+from body_tracking.camera.settings import DRIVER, MODEL, PEOPLE, SEARCH, THREADS, WAIT_NS, image_port, trackers_of
 from body_tracking.camera.topics import COMPRESSED, DRIVERS, RIG_SENSOR
 from body_tracking.camera.triangulation import match, triangulate
 from body_tracking.core.parameters import Parameter, Value
@@ -23,7 +20,6 @@ from body_tracking.markers import setup
 from body_tracking.markers.pairing import FrameSets
 from body_tracking.markers.rig_storage import load_rig
 from body_tracking.mesh.depth import DepthError, check_size
-from body_tracking.mesh.topics import IMAGES
 from body_tracking.messages.codecs import Codec, Skeletons
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.shared import RELIABLE as TRANSPORT
@@ -36,10 +32,6 @@ _COLOUR_TOPIC = Parameter(
 )
 _COMPRESSED = Parameter("compressed", False, "take the images that image_transport has compressed (JPEG or PNG)")
 _TOLERANCE = Parameter("tolerance", 0.01, "largest difference between the stamps of images of one time", "s", 0.0, 0.5)
-_WAIT_NS: Final = NANOSECONDS // 10
-"""Longest wait of an image for the others."""
-_KEPT: Final = 64
-"""Images of a topic that wait with the parameter ``reliable``."""
 
 
 class RigStage(Stage):
@@ -54,19 +46,15 @@ class RigStage(Stage):
         names = [setup.camera_name(camera.frame_id) for camera in self._rig.cameras]
         if len(names) < 2:
             raise graph.GraphError(f"setup: {', '.join(names)} alone; two cameras or more are needed")
-        model = PoseModel(
-            Path(str(values["model"])).expanduser() if values["model"] else default_folder(),
-            int(str(values["threads"])),
-        )
-        people, search = int(str(values["people"])), float(str(values["search_every"]))
-        self._trackers = {name: PersonTracker(model, people, search) for name in names}
+        new_tracker = trackers_of(values)
+        self._trackers = {name: new_tracker() for name in names}
         self._cameras = dict(zip(names, self._rig.cameras, strict=True))
-        self._numbers = PersonNumbers(people)
+        self._numbers = PersonNumbers(int(str(values["people"])))
         self._counters: Counter[str] = Counter()
         self._problems: dict[str, str] = {}
         self._people = 0
         tolerance_ns = round(float(str(values["tolerance"])) * NANOSECONDS)
-        self._sets: FrameSets[tuple[int, ImageArray]] = FrameSets(names, tolerance_ns, _WAIT_NS)
+        self._sets: FrameSets[tuple[int, ImageArray]] = FrameSets(names, tolerance_ns, WAIT_NS)
         compressed = bool(values["compressed"])
         pattern = str(values["colour_topic"]) or DRIVERS[str(values["driver"])].colour
         topics = [pattern.replace("{camera}", name) + COMPRESSED * compressed for name in names]
@@ -74,17 +62,7 @@ class RigStage(Stage):
             raise graph.GraphError(f"colour_topic: {pattern} is the same of all cameras; {{camera}} is their name")
         self._by_topic = dict(zip(topics, names, strict=True))
         codec: Codec = CompressedColour() if compressed else ColourImage()
-        # with `reliable` nothing is left out, however long it takes
-        leave_out = not values["reliable"]
-        self.inputs = tuple(
-            Port(
-                *(topic, codec, IMAGES, 0 if leave_out else _KEPT),
-                droppable=leave_out,
-                perishable=leave_out,
-                foreign=True,
-            )
-            for topic in topics
-        )
+        self.inputs = tuple(image_port(topic, codec, values) for topic in topics)
         self._topic = graph.skeleton_topic(RIG_SENSOR)
         self._pictures = {name: Pictures(name, float(str(values["picture_rate"])), wanted) for name in names}
         skeletons = Port(self._topic, Skeletons(), skeleton_qos(values), measured=True)

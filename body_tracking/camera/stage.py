@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import fields
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -13,11 +12,11 @@ from numpy.typing import NDArray
 
 from body_tracking.camera.codecs import ColourImage, CompressedColour, CompressedDepth
 from body_tracking.camera.lifting import is_flat, lift
-from body_tracking.camera.model_files import default_folder
 from body_tracking.camera.people import PersonTracker
 from body_tracking.camera.pictures import RATE, Pictures
-from body_tracking.camera.pose_model import ImageArray, Landmarks, PoseModel
+from body_tracking.camera.pose_model import ImageArray, Landmarks
 from body_tracking.camera.registration import Registration, is_registered, moved
+from body_tracking.camera.settings import DRIVER, MODEL, PEOPLE, SEARCH, THREADS, WAIT_NS, image_port, trackers_of
 from body_tracking.camera.topics import COMPRESSION, DRIVERS, CameraTopics, images_of
 from body_tracking.core.camera import Camera, CameraError
 from body_tracking.core.parameters import Parameter, Value
@@ -29,7 +28,6 @@ from body_tracking.markers.pairing import FrameSets
 from body_tracking.mesh.codecs import DepthImage, DepthInfo
 from body_tracking.mesh.depth import DepthError, check_size
 from body_tracking.mesh.person import COVERED, is_covered
-from body_tracking.mesh.topics import IMAGES
 from body_tracking.messages.codecs import Codec, Skeletons
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.shared import RELIABLE as TRANSPORT
@@ -37,9 +35,6 @@ from body_tracking.pipeline.shared import names_in, skeleton_qos
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
 
 CAMERAS = Parameter("cameras", (), "the cameras; the node publishes /<camera>/skeleton of each")
-DRIVER = Parameter(
-    "driver", "plain", "the cameras' ROS driver, which says on which topics they publish", choices=tuple(DRIVERS)
-)
 _TOPICS = tuple(
     Parameter(
         f"{field.name}_topic",
@@ -64,21 +59,11 @@ _DEPTH_POSE = Parameter(
     "pose of the depth camera in the colour camera's optical frame: x, y, z in metres and the quaternion x, y, z, w; "
     "empty where the driver registers the depth images to the colour images",
 )
-MODEL = Parameter(
-    "model", "", "folder of the networks (`body_tracking camera model` fetches them); empty for the user's cache"
-)
-PEOPLE = Parameter("people", 1, "the largest number of people per camera", min=1, max=6)
-SEARCH = Parameter("search_every", 0.3, "time between two searches for more people", "s", 0.0, 10.0)
 _TOLERANCE = Parameter(
     "tolerance", 0.02, "largest difference between the stamps of a colour and a depth image of one time", "s", 0.0, 0.5
 )
-THREADS = Parameter("threads", 1, "processors that a network may use", min=1, max=16)
 
 _COLOUR, _DEPTH = "colour", "depth"
-_KEPT: Final = 64
-"""Images of a topic that wait with the parameter ``reliable``: two seconds, 60 MB in colour at 640x480."""
-_WAIT_NS: Final = NANOSECONDS // 10
-"""Longest wait of an image for the other one."""
 FLAT: Final = "the person is flat: a picture of one?"
 
 
@@ -107,15 +92,13 @@ class CameraStage(Stage):
         if not names or len(set(names)) < len(names):
             raise graph.GraphError(f"cameras: {', '.join(names) or 'none'}; expected one or more, each once")
         pose = _pose(names_in(values["depth_pose"]))
-        folder = Path(str(values["model"])).expanduser() if values["model"] else default_folder()
-        model = PoseModel(folder, int(str(values["threads"])))
-        people, search = int(str(values["people"])), float(str(values["search_every"]))
+        new_tracker = trackers_of(values)
         tolerance_ns = round(float(str(values["tolerance"])) * NANOSECONDS)
         self._cameras = {
             name: ColourAndDepth(
                 name,
                 topics_of(name, values),
-                PersonTracker(model, people, search),
+                new_tracker(),
                 Pictures(name, float(str(values["picture_rate"])), wanted),
                 pose,
                 tolerance_ns,
@@ -129,14 +112,9 @@ class CameraStage(Stage):
             colour, depth = images_of(topics, compressed)
             colour_codec: Codec = ColourImage() if compressed == "none" else CompressedColour()
             depth_codec: Codec = CompressedDepth() if compressed == "both" else DepthImage()
-            # with `reliable` nothing is left out, however long it takes
-            leave_out = not values["reliable"]
             for topic, what, codec in ((colour, _COLOUR, colour_codec), (depth, _DEPTH, depth_codec)):
                 self._by_topic[topic] = camera, what
-                waiting = 0 if leave_out else _KEPT
-                inputs.append(
-                    Port(topic, codec, IMAGES, waiting, droppable=leave_out, perishable=leave_out, foreign=True)
-                )
+                inputs.append(image_port(topic, codec, values))
             for topic, what in ((topics.colour_info, f"{_COLOUR} info"), (topics.depth_info, f"{_DEPTH} info")):
                 self._by_topic[topic] = camera, what
                 inputs.append(Port(topic, DepthInfo(), LATCHED, foreign=True))
@@ -217,7 +195,7 @@ class ColourAndDepth:
         self._pose, self._problem = pose, ""
         self._infos: dict[str, Camera] = {}
         self._registration: Registration | None = None
-        self._sets: FrameSets[Any] = FrameSets((_COLOUR, _DEPTH), tolerance_ns, _WAIT_NS)
+        self._sets: FrameSets[Any] = FrameSets((_COLOUR, _DEPTH), tolerance_ns, WAIT_NS)
 
     @property
     def unpaired(self) -> Mapping[str, int]:
