@@ -61,6 +61,7 @@ class Benchmark(NamedTuple):
 BENCHMARKS = {
     "real_pairs": Benchmark(5, PAIRS, "--ekf"),
     "kinect_vs_vicon": Benchmark(1, recordings("kinect_vs_vicon")),
+    "baseline": Benchmark(4),
     "depth_images": Benchmark(1, MAKEHUMAN),
     "camera_skeleton": Benchmark(10, MAKEHUMAN),
     "mesh_fit": Benchmark(10, MAKEHUMAN),

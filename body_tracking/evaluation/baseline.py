@@ -31,6 +31,8 @@ from body_tracking.evaluation.robot_arm import ArmResult, compare
 
 _CSV: Final = (".csv", ".csv.gz")
 _AXES: Final = ("X", "Y", "Z")
+_GAP: Final = 0.15
+"""Seconds without a position from which on a curve is interrupted."""
 
 
 class Pendulum(NamedTuple):
@@ -161,12 +163,15 @@ def vicon_report(links: Sequence[tuple[str, list[Decay]]]) -> Report:
 def _draw_arm(result: ArmResult) -> bytes:
     figure = figure_of(5.0)
     axes = figure.subplots(2, len(_AXES), sharex=True, squeeze=False)
+    gaps = [np.flatnonzero(np.diff(each.times) > _GAP) + 1 for each in result.errors]
     for number, axis in enumerate(_AXES):
         above, below = axes[:, number]
         above.plot(result.errors[0].times, 1e3 * result.errors[0].true[:, number], "--", color="black", label="robot")
-        for colour, (trial, each) in enumerate(zip(result.trials, result.errors, strict=True)):
-            above.plot(each.times, 1e3 * each.found[:, number], color=f"C{colour}", linewidth=1.0, label=trial.name)
-            below.plot(each.times, 1e3 * (each.found - each.true)[:, number], color=f"C{colour}", linewidth=0.6)
+        for colour, (trial, each, gap) in enumerate(zip(result.trials, result.errors, gaps, strict=True)):
+            times = np.insert(each.times, gap, np.nan)
+            found, true = (np.insert(1e3 * side[:, number], gap, np.nan) for side in (each.found, each.true))
+            above.plot(times, found, color=f"C{colour}", linewidth=1.0, label=trial.name)
+            below.plot(times, found - true, color=f"C{colour}", linewidth=0.6)
         above.set_title(f"{axis} of the end effector, mm", fontsize=10)
         below.set_title(f"error of {axis}, mm", fontsize=10)
         below.set_xlabel("s", fontsize=8)
