@@ -12,13 +12,12 @@ import pytest
 from depth_recording import recording
 
 from body_tracking.core import so3
-from body_tracking.core.camera import Camera
 from body_tracking.core.clocks import ClockModel
 from body_tracking.core.orientation import OrientationError, SegmentOrientation
 from body_tracking.core.parameters import check_all
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import NANOSECONDS, Joint, SingleArray
-from body_tracking.mesh import body_model, stage, storage
+from body_tracking.mesh import body_model, storage
 from body_tracking.mesh.codecs import DepthImage, MeshMarker
 from body_tracking.mesh.depth import DepthError
 from body_tracking.mesh.person import COVERED
@@ -277,9 +276,3 @@ def test_an_orientation_counts_once_in_the_mesh_or_in_the_filter() -> None:
     assert specs["skeleton_filter"].defaults["orientations"] == ("pelvis",)
     (alone,) = [spec for spec in nodes_for(options_of(**given)) if spec.name == "skeleton_filter"]
     assert alone.defaults["orientations"] == ("forearm_left", "pelvis")
-
-
-def test_calibrations_are_compared_by_value() -> None:
-    own = recording().camera
-    assert stage._alike(own, replace(own, matrix=own.matrix.copy()))
-    assert not stage._alike(own, Camera(own.frame_id, own.width, own.height, own.matrix, np.zeros(5)))
