@@ -1,6 +1,6 @@
-"""The second half of the offline graph (filter, angles and writing the bag) in a process of its own.
+"""The second half of the offline graph in processes of its own: one filters, one computes angles and writes the bag.
 
-Each half takes about half of the time; the results are the same as in one process.
+With ``ekf`` the filter takes as long as all the rest; the results are the same as in one process.
 """
 
 from __future__ import annotations
@@ -10,8 +10,10 @@ import multiprocessing
 import os
 import threading
 import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,7 @@ from body_tracking.core.parameters import Value
 from body_tracking.core.qos import Qos
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.offline import OfflineRunner
+from body_tracking.pipeline.stage import Stage
 from body_tracking.pipeline.system import Place
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagError, BagWriter, remove_file
 from body_tracking.systems import NODES, stage_class
@@ -30,7 +33,7 @@ _BATCH = 128
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """Result of the second half.
+    """Result of the second half, or of its last part.
 
     Attributes:
         frames: number of joint angle messages.
@@ -43,7 +46,7 @@ class Written:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """Parameters of the second half.
+    """Parameters of the second half, or of its last part.
 
     Attributes:
         values: parameters of each stage, by its name.
@@ -66,14 +69,54 @@ def is_second(executable: str) -> bool:
 
 
 class Downstream:
-    """Writes every message, and runs the second half on it.
+    """Runs the second half: the filter in this process, and :class:`Last` where ``follow`` makes it.
+
+    Args:
+        job: of the second half.
+        follow: makes what runs the stages after the filter, and writes; here where None.
 
     Raises:
         BodyTrackingError: ``out`` cannot be written, or invalid parameters.
     """
 
+    def __init__(self, job: Job, follow: Callable[[Job], Last | ForkedDownstream] | None = None) -> None:
+        filters = [name for name in job.values if is_second(name) and not _is_last(name)]
+        self._stages = [stage_class(name)(job.values[name]) for name in filters]
+        self._runner = OfflineRunner(self._stages, BAG_WIRE, self._published, job.topics)
+        own = {p.topic: (p.codec.type_name, p.qos) for p in self._runner.outputs if not p.optional}
+        rest = {name: values for name, values in job.values.items() if name not in filters}
+        self._next = (follow or Last)(replace(job, values=rest, topics={**job.topics, **own}))
+
+    def take(self, topic: str, cdr: bytes, at_ns: int) -> None:
+        self._next.take(topic, cdr, at_ns)
+        self._runner.push(topic, cdr, at_ns)
+
+    def _published(self, topic: str, cdr: bytes, at_ns: int) -> None:
+        self._next.take(topic, cdr, at_ns)
+
+    def finish(self, at_ns: int) -> Written:
+        """Close the bag, or remove it if it has no angles."""
+        self._runner.finish(at_ns)
+        written = self._next.finish(at_ns)
+        # both may have counted the same message
+        counters = Counter(_counters(self._stages, self._runner)) | Counter(written.counters)
+        return Written(written.frames, counters)
+
+    @property
+    def path(self) -> Path | None:
+        """The file of the bag."""
+        return self._next.path
+
+    def abandon(self) -> None:
+        """Remove the unfinished bag."""
+        self._next.abandon()
+
+
+class Last:
+    """Runs the stages after the filter, and writes every message; errors as of :class:`Downstream`."""
+
     def __init__(self, job: Job) -> None:
-        self._stages = [stage_class(name)(values) for name, values in job.values.items() if is_second(name)]
+        self._stages = [stage_class(name)(values) for name, values in job.values.items() if _is_last(name)]
         self._runner = OfflineRunner(self._stages, BAG_WIRE, self._published, job.topics)
         self._covariance = job.model_covariance
         self._frames = 0
@@ -84,7 +127,8 @@ class Downstream:
                 self._writer.add_topic(topic, type_name, qos)
 
     def take(self, topic: str, cdr: bytes, at_ns: int) -> None:
-        self._writer.write(topic, cdr, at_ns)
+        if self._written(topic):
+            self._writer.write(topic, cdr, at_ns)
         self._runner.push(topic, cdr, at_ns)
 
     def _written(self, topic: str) -> bool:
@@ -92,43 +136,55 @@ class Downstream:
 
     def _published(self, topic: str, cdr: bytes, at_ns: int) -> None:
         self._frames += topic.endswith("/joint_states")
-        if self._written(topic):
-            self._writer.write(topic, cdr, at_ns)
+        self._writer.write(topic, cdr, at_ns)
 
     def finish(self, at_ns: int) -> Written:
-        """Close the bag, or remove it if it has no angles."""
         self._runner.finish(at_ns)
         if self._frames:
             self._writer.close()
         else:
             self._writer.discard()
-        counters = {
-            f"{'filter' if stage.NAME == 'skeleton_filter' else stage.NAME} {name}": count
-            for stage in self._stages
-            for name, count in stage.counters.items()
-        }
-        return Written(self._frames, {**counters, **self._runner.counters})
+        return Written(self._frames, _counters(self._stages, self._runner))
 
     @property
     def path(self) -> Path:
-        """The file of the bag."""
         return self._writer.path
 
     def abandon(self) -> None:
-        """Remove the unfinished bag."""
         self._writer.discard()
 
 
-class ForkedDownstream:
-    """:class:`Downstream` in a process of its own; arguments and errors as there."""
+def _is_last(executable: str) -> bool:
+    """Whether a stage comes after the filter."""
+    return NODES[executable].place > Place.FILTER
 
-    def __init__(self, job: Job) -> None:
+
+def _counters(stages: Sequence[Stage], runner: OfflineRunner) -> dict[str, int]:
+    counters = {
+        f"{'filter' if stage.NAME == 'skeleton_filter' else stage.NAME} {name}": count
+        for stage in stages
+        for name, count in stage.counters.items()
+    }
+    return {**counters, **runner.counters}
+
+
+class ForkedDownstream:
+    """:class:`Downstream` in a process of its own, with the filter's process as its child; errors as there.
+
+    Args:
+        job: of the second half.
+        last: run :class:`Last` alone; else its process is a child of this one's.
+    """
+
+    def __init__(self, job: Job, *, last: bool = False) -> None:
         context = multiprocessing.get_context("fork")
         self._connection, remote = context.Pipe()
         # Removed if the process is killed before it reports its file, unless the bag existed before.
-        self._path = None if job.out.exists() else job.out.absolute() / f"{job.out.absolute().name}_0.mcap"
-        self._process = context.Process(target=_serve, args=(self._connection, remote, job), daemon=True)
+        self.path = None if job.out.exists() else job.out.absolute() / f"{job.out.absolute().name}_0.mcap"
+        # a daemon may have no child
+        self._process = context.Process(target=_serve, args=(self._connection, remote, job, last), daemon=last)
         self._batch: list[tuple[str, bytes, int]] = []
+        self._error: BaseException | None = None
         with warnings.catch_warnings():
             # Python 3.12 warns of forking with threads; those of the numeric libraries handle it.
             warnings.simplefilter("ignore", DeprecationWarning)
@@ -140,7 +196,7 @@ class ForkedDownstream:
                 if enabled:
                     gc.enable()
         remote.close()
-        self._path = self._receive()
+        self.path = self._receive()
 
     def take(self, topic: str, cdr: bytes, at_ns: int) -> None:
         self._batch.append((topic, cdr, at_ns))
@@ -159,10 +215,12 @@ class ForkedDownstream:
         """Remove the unfinished bag."""
         self._connection.close()
         self._process.join()
-        if self._path is not None:
-            remove_file(self._path)  # still there where the other process was killed
+        if self.path is not None:
+            remove_file(self.path)  # still there where the other process was killed
 
     def _send(self) -> None:
+        if self._error is not None:  # raised before, where a runner took it for one of its stages'
+            raise self._error
         try:
             self._connection.send(self._batch)
         except (BrokenPipeError, ConnectionResetError):
@@ -174,29 +232,30 @@ class ForkedDownstream:
             answer = self._connection.recv()
         except (EOFError, ConnectionResetError):  # the latter if it left data unread
             self.abandon()
-            raise BagError(f"the process that writes the bag ended with code {self._process.exitcode}") from None
+            answer = BagError(f"the process that writes the bag ended with code {self._process.exitcode}")
         if isinstance(answer, BaseException):
             self._process.join()
+            self._error = answer
             raise answer
         return answer
 
 
-def _serve(inherited: Connection, connection: Connection, job: Job) -> None:
+def _serve(inherited: Connection, connection: Connection, job: Job, last: bool) -> None:
     """The other process."""
     # With this copy of the first process's end open, recv() would not notice that it was closed there.
     inherited.close()
     # Inherited garbage must not be collected here: ROS nodes, whose threads do not exist in this process, would crash.
     gc.freeze()
     gc.enable()
-    downstream: Downstream | None = None
+    downstream: Downstream | Last | None = None
     try:
-        downstream = Downstream(job)
+        downstream = Last(job) if last else Downstream(job, partial(ForkedDownstream, last=True))
         connection.send(downstream.path)
         while isinstance(batch := connection.recv(), list):
             for topic, cdr, at_ns in batch:
                 downstream.take(topic, cdr, at_ns)
         connection.send(downstream.finish(batch))
-    except (EOFError, KeyboardInterrupt):
+    except (EOFError, BrokenPipeError, ConnectionResetError, KeyboardInterrupt):  # the first process has ended
         if downstream is not None:
             downstream.abandon()
     except BaseException as error:
@@ -206,7 +265,7 @@ def _serve(inherited: Connection, connection: Connection, job: Job) -> None:
 
 
 def start_downstream(job: Job) -> Downstream | ForkedDownstream:
-    """The second half, in another process if the platform allows it and there are two processors.
+    """The second half, in other processes if the platform allows it and there are two processors.
 
     Raises:
         BodyTrackingError: as of :class:`Downstream`.

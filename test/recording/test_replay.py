@@ -104,7 +104,7 @@ def test_deviations_are_finite_where_something_is_known(replayed_wave: Path) -> 
 
 
 @pytest.mark.parametrize("filter_name", some([DEFAULT_FILTER, "ekf"]))
-def test_one_process_and_two_give_the_same_messages_each_time(
+def test_one_process_and_several_give_the_same_messages_each_time(
     replayed_wave: Path, wave: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, filter_name: str
 ) -> None:
     settings = ReplaySettings(filter_name=filter_name)
@@ -423,29 +423,30 @@ def test_an_error_while_frames_come_ends_both_processes(tmp_path: Path, monkeypa
     assert not multiprocessing.active_children()
 
 
-@pytest.mark.parametrize("victim", some(["reader", "writer"]))
-def test_where_one_process_is_killed_the_other_ends_and_leaves_no_bag(tmp_path: Path, victim: str) -> None:
+@pytest.mark.parametrize("victim", some(["reader", "writer", "filter"], 2))
+def test_where_one_process_is_killed_the_others_end_and_leave_no_bag(tmp_path: Path, victim: str) -> None:
     out = tmp_path / "out"
     arguments = [sys.executable, "-m", "body_tracking.cli", "replay", str(BAG), "-o", str(out)]
     reader = psutil.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    writers: list[psutil.Process] = []
+    others: list[psutil.Process] = []
     deadline = time.monotonic() + 60.0
     try:
-        while not out.exists() or not writers:
+        while not out.exists() or len(others) < 2:
             assert time.monotonic() < deadline
-            writers = reader.children()
+            others = reader.children(recursive=True)
             time.sleep(0.01)
-        (writers[0] if victim == "writer" else reader).kill()
+        {"reader": reader, "filter": others[0], "writer": others[1]}[victim].kill()
         _, reported = reader.communicate(timeout=60.0)
         while out.exists():
             assert time.monotonic() < deadline
             time.sleep(0.01)
     finally:
-        for process in (*writers, reader):
+        for process in (*others, reader):
             with contextlib.suppress(psutil.NoSuchProcess):
                 process.kill()
-    if victim == "writer":
-        assert reader.returncode == 2
+    assert not psutil.wait_procs(others, timeout=60.0)[1]
+    if victim != "reader":
+        assert reader.returncode == 2, reported.decode()
         assert reported.count(b"\n") == 1
 
 
