@@ -29,6 +29,8 @@ _SETTLE_AFTER = 0.3
 """Share of the settle time before which no length stays: a person has to be seen in more than one pose."""
 _AWAY_NS = NANOSECONDS // 4
 """Unseen for longer than this, a limb may have turned farther than a linearisation reaches."""
+_YOUNG = 1.0
+"""Seconds from the start on in which a pose may be far from where a frame is linearised."""
 _TINY = 1e-30
 _ENOUGH_BLOCKS = 5
 """Seconds of frames from which on the lengths are what these say."""
@@ -104,12 +106,18 @@ class SkeletonUpdate:
             LinAlgError: its covariance is none.
         """
         back = measurement.measured & (measurement.stamp_ns - state.used_ns > _AWAY_NS)
-        state = self._corrected(state, measurement)
+        state = self._corrected(state, measurement, bool(back.any()))
         state = self._poses.searched(state, measurement, back)
         return self._priors.within(self._priors.bounded(self._measured(state, measurement)))
 
-    def _corrected(self, state: State, measurement: Measurement) -> State:
-        """The Kalman update with the points that pass the gate; what was learnt of the sensor."""
+    def _corrected(self, state: State, measurement: Measurement, back: bool) -> State:
+        """The Kalman update with the points that pass the gate; what was learnt of the sensor.
+
+        Args:
+            state: of the measurement's time.
+            measurement: the frame.
+            back: a point had been away for long.
+        """
         space = self._space
         dt = max(0.0, (measurement.stamp_ns - self._last_stamp(state, measurement)) / NANOSECONDS)
         sensor = state.sensors.get(measurement.sensor) or self._sensors.unknown(measurement)
@@ -148,9 +156,11 @@ class SkeletonUpdate:
         rows: IntArray = np.flatnonzero(np.repeat(used, 3))
         predicted_variance = seen.own[used].reshape(count, -1) @ _MEAN_VARIANCE - sensor.white[used]
         correction = np.zeros(len(state.covariance))
-        # Cameras alone are as accurate with one linearisation. Against orientations that are far from a camera's arm it
-        # is one of few: a source would be taken for slipped.
-        for left in reversed(range(LINEARISATIONS if state.sources.names else 1)):
+        # Of a person who is followed, cameras alone are as accurate with one linearisation. At the start and after an
+        # absence it would leave an arm turned about itself, and sure of it, which a source's alignment then learns.
+        # Against orientations that are far from a camera's arm a source would be taken for slipped.
+        far = back or bool(state.sources.names) or state.tracked < _YOUNG
+        for left in reversed(range(LINEARISATIONS if far else 1)):
             sound, whitening, gain, white, covariance = solved(
                 seen.covariance, blocks, seen.cross, seen.innovation, state.covariance, rows
             )
