@@ -110,13 +110,13 @@ class SkeletonUpdate:
         state = self._poses.searched(state, measurement, back)
         return self._priors.within(self._priors.bounded(self._measured(state, measurement)))
 
-    def _corrected(self, state: State, measurement: Measurement, back: bool) -> State:
+    def _corrected(self, state: State, measurement: Measurement, reappeared: bool) -> State:
         """The Kalman update with the points that pass the gate; what was learnt of the sensor.
 
         Args:
             state: of the measurement's time.
             measurement: the frame.
-            back: a point had been away for long.
+            reappeared: a point had been away for long.
         """
         space = self._space
         dt = max(0.0, (measurement.stamp_ns - self._last_stamp(state, measurement)) / NANOSECONDS)
@@ -159,7 +159,7 @@ class SkeletonUpdate:
         # Of a person who is followed, cameras alone are as accurate with one linearisation. At the start and after an
         # absence it would leave an arm turned about itself, and sure of it, which a source's alignment then learns.
         # Against orientations that are far from a camera's arm a source would be taken for slipped.
-        far = back or bool(state.sources.names) or state.tracked < _YOUNG
+        far = reappeared or bool(state.sources.names) or state.tracked < _YOUNG
         for left in reversed(range(LINEARISATIONS if far else 1)):
             sound, whitening, gain, white, covariance = solved(
                 seen.covariance, blocks, seen.cross, seen.innovation, state.covariance, rows
