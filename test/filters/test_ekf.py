@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 from estimates import assert_same, known
 from numpy.testing import assert_allclose, assert_array_equal
-from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from bent_hands import hand_columns, turned_over
 from body_tracking.core.measurement import BASE_STDDEV, joint_correlation
 from body_tracking.core.skeleton import (
     MIRROR,
@@ -579,43 +577,6 @@ def test_the_first_frame_is_met_although_the_pose_is_far_from_where_it_is_linear
     estimate = known(estimator)
     found = MODEL.forward(estimate.q, estimate.lengths).positions
     assert np.linalg.norm(found - points, axis=1).max() < 0.006
-
-
-def bent_hands(count: int, seconds: float, bent_at: float = 0.0) -> list[tuple[int, Truth, str]]:
-    """(seed, what is true, side) of people who have bent a wrist by more than 40 degrees at some time."""
-    found: list[tuple[int, Truth, str]] = []
-    seed = 0
-    while len(found) < count:
-        truth = random_truth(seed, seconds)
-        then = int(np.searchsorted(truth.times, bent_at))
-        angles = MODEL.difference(MODEL.neutral(), truth.q[then])
-        found += [
-            (seed, truth, side) for side in ("left", "right") if abs(angles[hand_columns(side)[1]]) > np.radians(40.0)
-        ]
-        seed += 1
-    return found[:count]
-
-
-@pytest.mark.parametrize(("begin", "noise"), some([(0.0, 0.025), (0.7, 0.02), (0.0, 0.006)], 2))
-def test_a_hand_turned_over_is_right_soon(begin: float, noise: float) -> None:
-    """From the start, or later, as if an unseen movement had ended in the wrong pose: after 1.5 s at most."""
-    seconds, end = (1.2, 0.5) if begin == 0.0 else (2.5, 2.2)
-    for seed, truth, side in bent_hands(draws(2, 6 if begin else 10), seconds, begin):
-        estimator, turned = ExtendedKalmanFilter(), begin == 0.0
-        if turned:
-            estimator.start(turned_over(truth.q[0], side), truth.lengths, START_NS - 1)
-        hand = MODEL.segment_names.index(f"hand_{side}")
-        true = MODEL.forward(truth.q, truth.lengths).rotations[:, hand]
-        for skeleton, time, right in zip(measured(truth, noise).skeletons, truth.times, true, strict=True):
-            estimator.update(skeleton)
-            state = estimator._state
-            if time > begin and not turned:
-                assert state is not None
-                estimator._state = state.but(q=turned_over(state.q, side))
-                turned = True
-            elif time > end:
-                found = MODEL.forward(known(estimator).q, known(estimator).lengths).rotations[hand]
-                assert np.degrees(Rotation.from_matrix(found.T @ right).magnitude()) < 75.0, (seed, side)
 
 
 def test_an_arm_that_comes_back_elsewhere_is_found_within_two_frames() -> None:

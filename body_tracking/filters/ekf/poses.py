@@ -24,20 +24,12 @@ _MOST_ATTEMPTS = 4
 other, and no pose fits all of them."""
 _SOON = 4
 """Multiple of this time after which a search is independent of the last one."""
-_LOOK_NS = NANOSECONDS // 2
-"""Least time when only a hand is suspected, which noise often causes, and lengths are fixed: fixed lengths do not adapt
-to a wrong hand, so its innovations persist."""
 _WHOLE = 15
 """Least number of points of a frame for an estimate of a person's size."""
 _MUCH_BETTER = 0.5
 _STRAINED = 4.0
 """Squared Mahalanobis distance of a mean innovation that a right pose does not reach: it stays below 1 with little
-noise and below 3 with much; a hand in the wrong elbow or wrist branch reaches 2 to 5."""
-_SUSPICIOUS = 1.0
-"""Squared Mahalanobis distance from which the other branch of a hand is tested: rarely with little noise, and mostly in
-a wrong branch, to which lengths that are still estimated adapt."""
-_LIKELIER = 3.0
-"""Log likelihood ratio, half the difference of two costs, for another pose: 20 to 1."""
+noise and below 3 with much."""
 _FIRST_SPEED, _FIRST_TURN_RATE = 0.3, 1.0
 """m/s and rad/s: standard deviation of the velocities of a person who is first seen."""
 _CONTRADICTION = 0.8
@@ -179,12 +171,12 @@ class PoseSearch:
         if back.any() and self._astray(state, measurement, back):
             points, stddev = self._as_fitted(measurement, state)
             return self._restarted(state, points, stddev, _MUCH_BETTER).but(attempted_ns=state.stamp_ns)
-        return self._looked_anew(state, measurement) if state.strain > _SUSPICIOUS else state
+        return self._looked_anew(state, measurement) if state.strain > _STRAINED else state
 
     def _looked_anew(self, state: State, measurement: Measurement) -> State:
         """Search for a better pose, more rarely after failed searches."""
         elapsed, rest = state.stamp_ns - state.attempted_ns, _REST_NS << min(state.attempts, _MOST_ATTEMPTS)
-        if elapsed < rest or (state.strain < _STRAINED and state.settled and elapsed < _LOOK_NS):
+        if elapsed < rest:
             return state
         attempts = state.attempts + 1 if elapsed < _SOON * rest else 0
         return self._straightened(state, measurement).but(attempted_ns=state.stamp_ns, attempts=attempts)
@@ -250,31 +242,8 @@ class PoseSearch:
         points = np.where(sure[:, None], posture.positions + state.lean, np.nan)
         stddev = self._sensors.point_stddev(measurement, state.sensors)
         stddev = np.where(np.isfinite(stddev), np.sqrt(stddev**2 / np.maximum(state.leaning, 1.0) + MISFIT**2), np.inf)
-        turned = self._hands_turned(state, points, stddev)
-        if turned is not state or state.strain < _STRAINED:
-            return turned
         state = state.but(lean=np.zeros_like(state.lean), leaning=np.zeros(self._space.points), strain=0.0)
         return self._restarted(state, points, stddev, _MUCH_BETTER)
-
-    def _hands_turned(self, state: State, points: FloatArray, stddev: FloatArray) -> State:
-        """Restart with the other branch of a hand if that is much likelier; else the current state.
-
-        Estimated lengths adapt to a hand in the wrong branch, such as a short thumb. So the likelihood includes that of
-        the estimated lengths against average ones.
-        """
-        lengths, unlikely = state.lengths, 0.0
-        if not state.settled:
-            lengths = self._lengths_of(points)
-            off = state.lengths - lengths
-            unlikely = 0.5 * float(off @ np.linalg.solve(self._space.lengths_covariance, off))
-        fit = self.inverse.solve(points, stddev, lengths, state.q, tolerance=CLOSE, alternatives=True)
-        if not self.inverse.is_turned(state.q, fit.q) or self._contradicts(state, fit.q):
-            return state
-        stays = self.inverse.solve(points, stddev, state.lengths, state.q, tolerance=CLOSE)
-        if stays.cost + unlikely < fit.cost + _LIKELIER:
-            return state
-        self._counters["restarts"] += 1
-        return self.new_state(state.stamp_ns, fit.q, lengths, stddev, state, keep_lengths=state.settled)
 
     def _lengths_of(self, points: FloatArray) -> FloatArray:
         """(21,) average proportions at the size of the person that is seen."""
