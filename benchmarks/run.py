@@ -76,6 +76,7 @@ BENCHMARKS = {
     "ablation": Benchmark(40, options="--seeds 1 --layouts 2,4"),
     "honesty": Benchmark(3, options="--runs 40"),
     "robustness": Benchmark(10, options="--runs 100"),
+    "teleports": Benchmark(15, options="--runs 12"),
     "imu_and_camera": Benchmark(40, options="--seeds 1"),
     "imu_only": Benchmark(25, options="--motions reaching,punching"),
     "imu_faults": Benchmark(20, options="--seeds 1"),

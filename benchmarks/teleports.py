@@ -1,0 +1,225 @@
+"""Do published angles teleport? Steps between frames that no person makes, and what a replay costs with each filter.
+
+A teleport is a step of an angle by more than 60 degrees between two frames, no more than 0.1 s apart, with stated
+deviations below 15 degrees. Every angle of the filter's default convention counts, in three kinds of recordings:
+
+simulated   people of seeds that nothing was tuned on: all motions by turns, layouts 1 to 9 by turns
+pairs       the nine real pairs of Kinect v2 sensors (``kinect_pairs``)
+clips       real exercises of the right arm before one Kinect v2 (``kinect_vs_vicon``)
+
+Recordings and pairs are replayed as ``body_tracking replay`` does, both filters in turns; clips are filtered frame by
+frame. ``known`` is the share of the frames with angles in which elevation, plane of elevation, elbow and trunk angles
+are stated with a deviation below 15 degrees (the plane where the arm is raised by 30 to 150). ``cpu`` is the
+processor time of a replay, both halves, in seconds per second of the recording; ``speed`` how many times faster than
+the recording it was, which depends on what else the machine does.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import common
+import numpy as np
+from kinect_vs_vicon import kinect_skeletons
+
+from body_tracking.calibration.arm_directions import corrected_arms
+from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray
+from body_tracking.evaluation.metrics import wrapped
+from body_tracking.evaluation.reading import AngleSeries, read
+from body_tracking.filters import DEFAULT_FILTER, ModelFilter, make_filter
+from body_tracking.kinematics.conventions import angles_of
+from body_tracking.kinematics.positional import positional_angles
+from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.recording.importer import import_files
+from body_tracking.recording.replay import ReplaySettings, replay
+from body_tracking.simulation.bags import write_bag
+from body_tracking.simulation.layouts import NUMBERS, layout
+from body_tracking.simulation.repertoire import MOTIONS
+from body_tracking.simulation.scene import Setup, simulate
+
+FILTERS = (DEFAULT_FILTER, "ekf")
+STEP, SURE = np.radians(60.0), np.radians(15.0)
+SOON_NS = NANOSECONDS // 10
+"""Frames that are farther apart do not follow each other."""
+ALLOWED = 0
+"""Teleports."""
+KNOWN = 90.0
+"""Percent of the frames of a real pair."""
+PARTS = ("simulated", "pairs", "clips")
+RAISED = np.radians(30.0), np.radians(150.0)
+_FIRST_SEED = 5300
+"""Far from the seeds of every other benchmark."""
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """A recording to look at: its part, its name, and its file or the number of the simulated run."""
+
+    part: str
+    name: str
+    file: Path | None = None
+    number: int = 0
+
+
+def teleports(angles: AngleSeries) -> list[str]:
+    """Where: the angle, the second, and the step in degrees."""
+    steps = np.abs(wrapped(np.diff(angles.position, axis=0)))
+    sure = np.maximum(angles.stddev[1:], angles.stddev[:-1]) < SURE
+    sure &= (np.diff(angles.stamps_ns) < SOON_NS)[:, None]
+    seconds = (angles.stamps_ns - angles.stamps_ns[0]) / NANOSECONDS
+    return [
+        f"{angles.names[column]} at {seconds[row + 1]:.2f} s by {np.degrees(steps[row, column]):.0f}"
+        for row, column in np.argwhere((steps > STEP) & sure)
+    ]
+
+
+def known(angles: AngleSeries) -> dict[str, float]:
+    """Percentage of the frames in which an angle is stated with a small deviation, the least of each kind."""
+    trunk = "thorax" if any(name.startswith("thorax") for name in angles.names) else "trunk"
+    kinds = {"elevation": "shoulder_elevation", "plane": "shoulder_plane", "elbow": "elbow", "trunk": trunk}
+    found: dict[str, float] = {}
+    for kind, part in kinds.items():
+        for column, name in enumerate(angles.names):
+            if part not in name:
+                continue
+            counted = np.ones(len(angles.stamps_ns), dtype=np.bool_)
+            if kind == "plane":
+                counted = _raised(angles, name.rpartition("_")[2])
+            if counted.any():
+                share = 100.0 * float((angles.stddev[counted, column] < SURE).mean())
+                found[kind] = min(found.get(kind, 100.0), share)
+    return found
+
+
+def _raised(angles: AngleSeries, side: str) -> BoolArray:
+    """(n,) whether the plane of elevation of an arm means anything."""
+    elevation = np.abs(angles.position[:, angles.names.index(f"shoulder_elevation_{side}")])
+    raised: BoolArray = (elevation > RAISED[0]) & (elevation < RAISED[1])
+    return raised
+
+
+def _cpu() -> float:
+    spent = os.times()
+    return spent.user + spent.system + spent.children_user + spent.children_system
+
+
+def of_replays(job: Job) -> dict[str, dict[str, Any]]:
+    """The figures of a recording with each filter."""
+    found = {}
+    with tempfile.TemporaryDirectory() as folder:
+        bag = Path(folder) / "in"
+        if job.file is None:
+            number = job.number
+            setup = Setup(
+                list(MOTIONS)[number % len(MOTIONS)], layout(NUMBERS[number % len(NUMBERS)]), seed=_FIRST_SEED + number
+            )
+            write_bag(simulate(setup), bag)
+        else:
+            import_files([job.file], bag)
+        for name in FILTERS:
+            before = _cpu()
+            report = replay(bag, Path(folder) / name, ReplaySettings((), filter_name=name))
+            spent = _cpu() - before
+            angles = read(Path(folder) / name).angles
+            found[name] = {
+                "teleports": teleports(angles),
+                "frames": len(angles.stamps_ns),
+                "cpu": spent / report.recording_s,
+                "speed": report.recording_s / report.elapsed_s,
+                **known(angles),
+            }
+    return found
+
+
+def of_clip(job: Job) -> dict[str, dict[str, Any]]:
+    """The figures of a clip with each filter."""
+    assert job.file is not None
+    skeletons = [corrected_arms(each) for each in kinect_skeletons(job.file)]
+    found = {}
+    for name in FILTERS:
+        chosen, series, last = make_filter(name), [], None
+        for each in skeletons:
+            out = chosen.update(each)
+            if out is None:
+                continue
+            if isinstance(chosen, ModelFilter):
+                estimate = chosen.estimate
+                assert estimate is not None
+                last = angles_of(estimate, UpperBody(), "model", last)
+            else:
+                last = positional_angles(out)
+            series.append(last)
+        angles = AngleSeries(
+            np.array([each.stamp_ns for each in series], dtype=np.int64),
+            series[0].names,
+            np.stack([each.position for each in series]),
+            np.stack([each.position_stddev for each in series]),
+        )
+        found[name] = {"teleports": teleports(angles), "frames": len(series)}
+    return found
+
+
+def measure(job: Job) -> dict[str, dict[str, Any]]:
+    """The figures of any recording."""
+    return of_clip(job) if job.part == "clips" else of_replays(job)
+
+
+def summary(results: list[dict[str, dict[str, Any]]]) -> dict[str, dict[str, Any]]:
+    """Of each filter over several recordings: sums of frames and teleports, medians of the rest."""
+    found: dict[str, dict[str, Any]] = {}
+    for name in FILTERS:
+        own = [each[name] for each in results]
+        row: dict[str, Any] = {
+            "recordings": len(own),
+            "frames": sum(each["frames"] for each in own),
+            "teleports": sum(len(each["teleports"]) for each in own),
+        }
+        for column in ("cpu", "speed", "elevation", "plane", "elbow", "trunk"):
+            values = [each[column] for each in own if column in each]
+            if values:
+                row[column] = float(np.median(values))
+        found[name] = row
+    if all("cpu" in found[name] for name in FILTERS):
+        ratios: FloatArray = np.array([each["ekf"]["cpu"] / each[DEFAULT_FILTER]["cpu"] for each in results])
+        found["ekf"]["cpu of default"] = float(np.median(ratios))
+    return found
+
+
+def main() -> int:
+    """The benchmark; 1 where an angle teleports."""
+    parser = common.parser(__doc__, jobs=True, data=True)
+    parser.add_argument("--parts", type=common.names, default=list(PARTS), help=f"which of {','.join(PARTS)}")
+    parser.add_argument("--runs", type=int, default=40, metavar="N", help="simulated runs (default: %(default)s)")
+    args = parser.parse_args()
+    pairs = sorted((args.data / "kinect_pairs").glob("p??_*.csv.gz"))
+    clips = sorted((args.data / "kinect_vs_vicon").glob("*_kinect.csv.gz"))
+    jobs = [Job("simulated", f"run {number}", number=number) for number in range(args.runs)]
+    jobs += [Job("pairs", file.name.split(".")[0], file) for file in pairs]
+    jobs += [Job("clips", file.name.split(".")[0], file) for file in clips]
+    jobs = [job for job in jobs if job.part in args.parts]
+    if not jobs:
+        return common.ABSENT
+    results = common.mapped(measure, jobs, args.jobs)
+    figures: dict[str, Any] = {}
+    for part in dict.fromkeys(job.part for job in jobs):
+        figures[part] = summary([result for job, result in zip(jobs, results, strict=True) if job.part == part])
+    where = {
+        f"{job.name}, {name}": result[name]["teleports"]
+        for job, result in zip(jobs, results, strict=True)
+        for name in FILTERS
+        if result[name]["teleports"]
+    }
+    common.report(args, figures | {"where": where})
+    counts = {name: sum(part[name]["teleports"] for part in figures.values()) for name in FILTERS}
+    return common.verdicts(
+        args, {f"{name}: {count} teleports, allowed {ALLOWED}": count <= ALLOWED for name, count in counts.items()}
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
