@@ -84,7 +84,7 @@ demo-camera: $(STAMP) ## the same with colour and depth images: from the people 
 	@echo "recording: $(DEMO_CAMERA)/recording"
 
 # The tests that compute, and lint, take what is left of the processors by those that start processes. These wait more than
-# they compute: three run at a time, and one at a time where they state how soon something happens (these first, since they
+# they compute: four run at a time, and one at a time where they state how soon something happens (these first, since they
 # leave most). All of it runs, whatever fails. The workspace for test/ros2 is made before, and does not count as time of the tests.
 test: $(STAMP) ## formatting, lint, types and the tests, in five minutes
 	@$(call tests,not slow)
@@ -99,7 +99,7 @@ phase() { name="$$1"; shift; echo "== $$name"; $(BIN)/python -m pytest "$$@" || 
 nice -n 19 $(MAKE) --no-print-directory lint >$(VENV)/lint.txt 2>&1 & lint=$$!; \
 nice -n 19 $(BIN)/python -m pytest -m "($(1)) and not processes" --numprocesses 2 --dist worksteal >$(VENV)/compute.txt 2>&1 & compute=$$!; \
 phase "tests of time" -m "($(1)) and processes and alone"; \
-phase "tests of processes" -m "($(1)) and processes and not alone" --numprocesses 3 --dist loadscope --no-loadscope-reorder; \
+phase "tests of processes" -m "($(1)) and processes and not alone" --numprocesses 4 --dist loadscope --no-loadscope-reorder; \
 echo "== tests that compute"; wait $$compute || failed="$$failed, tests that compute"; cat $(VENV)/compute.txt; \
 echo "== formatting, lint, types"; wait $$lint || failed="$$failed, formatting, lint, types"; cat $(VENV)/lint.txt; \
 [ -z "$$failed" ] || { echo "make: failed:$${failed#,}" >&2; exit 1; }
