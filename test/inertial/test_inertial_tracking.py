@@ -128,6 +128,7 @@ def test_two_exchanged_sensors_are_reported_and_reassigned(wrists: Fed) -> None:
         assert covered(fed, segment, 14.0).mean() > 0.9
 
 
+@pytest.mark.slow
 def test_a_pose_alone_names_no_swap_of_wrist_sensors() -> None:
     """A T-pose with swapped sensors is one half a turn on, and nobody knows where north is: motion has to tell them."""
     for seed in range(draws(2, 20)):

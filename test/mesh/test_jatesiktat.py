@@ -232,6 +232,7 @@ def test_a_forearms_direction_is_all_that_an_imu_gives(fitter: JatesiktatFitter)
         assert residuals @ residuals == pytest.approx(expected, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_the_rough_shape_has_the_lengths_of_the_skeleton() -> None:
     model = body_model.load()
     rng = np.random.default_rng(6)
