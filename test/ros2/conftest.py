@@ -17,7 +17,9 @@ HERE = Path(__file__).resolve().parent
 SETUP = HERE.parents[1] / ".ros2_workspace" / "setup.sh"
 ABSENT = 77
 """Exit code of ``workspace`` where the sources of ``ros2`` are not there."""
-OWN = ("HOME", "LANG", "PATH", "TMPDIR")
+PROCESSOR = ("OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES", "NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES")
+"""By which another processor is emulated; compiled code is kept for each."""
+OWN = ("HOME", "LANG", "PATH", "TMPDIR", "XDG_CACHE_HOME", *PROCESSOR)
 """All that a terminal in which the workspace is sourced takes over from the tests."""
 
 
