@@ -25,6 +25,7 @@ from body_tracking.core.signals import ENDING, release_signals
 from body_tracking.ros import dds
 from body_tracking.ros.declare import parameter_files
 from body_tracking.ros.executor import LeanExecutor
+from body_tracking.ros.leaving import leaving_within
 
 if TYPE_CHECKING:
     from body_tracking.ros.node import GraphNode
@@ -139,13 +140,12 @@ def run(node_class: type[GraphNode]) -> None:
     finally:
         if node is not None:
             node.close()
-        # The middleware may block forever while it destroys the node; nothing is lost by then.
-        faulthandler.dump_traceback_later(_LEAVE_S, exit=True)
-        if node is not None:
-            with contextlib.suppress(InvalidHandle):
-                node.destroy_node()
-        rclpy.try_shutdown()
-        faulthandler.cancel_dump_traceback_later()
+        # nothing is lost by then
+        with leaving_within(_LEAVE_S, code if sys.exc_info()[0] is None else 1):
+            if node is not None:
+                with contextlib.suppress(InvalidHandle):
+                    node.destroy_node()
+            rclpy.try_shutdown()
         handler.ignore_sigint()
     if code:
         sys.exit(code)

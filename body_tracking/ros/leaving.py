@@ -1,0 +1,59 @@
+"""Leaving a process that the middleware blocks."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import faulthandler
+import sys
+from collections.abc import Iterator
+
+_CLOCK_MONOTONIC, _SIGEV_THREAD = 1, 2
+
+
+class _Sigevent(ctypes.Structure):
+    """``struct sigevent`` of Linux; ``value`` is what the function is called with."""
+
+    _fields_ = (
+        ("value", ctypes.c_void_p),
+        ("signo", ctypes.c_int),
+        ("notify", ctypes.c_int),
+        ("function", ctypes.c_void_p),
+        ("attributes", ctypes.c_void_p),
+        ("rest", ctypes.c_char * 32),
+    )
+
+
+@contextlib.contextmanager
+def leaving_within(seconds: float, code: int) -> Iterator[None]:
+    """End the process where what is done within takes longer than that.
+
+    Fast DDS can deadlock while it destroys a node's entities: the thread that removes a reader of another process and
+    the one that destroys the writer wait for each other (seen with 2.14, where many nodes end at once on a busy
+    machine). rclpy holds the interpreter's lock then, so that no thread of Python can end the process. A timer of the
+    C library calls ``_exit`` in a thread of its own.
+
+    Args:
+        seconds: after which the process ends.
+        code: with which it ends then.
+    """
+    for stream in (sys.stdout, sys.stderr):  # _exit would lose what they have not written
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
+    library = ctypes.CDLL(None)
+    event = _Sigevent(code, 0, _SIGEV_THREAD, ctypes.cast(library._exit, ctypes.c_void_p))
+    timer = ctypes.c_void_p()
+    create = getattr(library, "timer_create", None)  # before glibc 2.34 in another library
+    if create is None or create(_CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer)):
+        faulthandler.dump_traceback_later(seconds, exit=True)
+        try:
+            yield
+        finally:
+            faulthandler.cancel_dump_traceback_later()
+        return
+    whole, part = divmod(seconds, 1.0)
+    library.timer_settime(timer, 0, (ctypes.c_long * 4)(0, 0, int(whole), int(1e9 * part)), None)
+    try:
+        yield
+    finally:
+        library.timer_delete(timer)
