@@ -28,10 +28,10 @@ class _Sigevent(ctypes.Structure):
 def leaving_within(seconds: float, code: int) -> Iterator[None]:
     """End the process where what is done within takes longer than that.
 
-    Fast DDS can deadlock while it destroys a node's entities: the thread that removes a reader of another process and
-    the one that destroys the writer wait for each other (seen with 2.14, where many nodes end at once on a busy
-    machine). rclpy holds the interpreter's lock then, so that no thread of Python can end the process. A timer of the
-    C library calls ``_exit`` in a thread of its own.
+    A process that is killed may hold a mutex in the shared memory by which Fast DDS 2.14 sends. Its thread for timers
+    then waits for that mutex for ever (``SharedMemManager::Port::regenerate_port``), and who destroys a writer waits
+    for that thread. rclpy holds the interpreter's lock meanwhile, so that no thread of Python can end the process. A
+    timer of the C library calls ``_exit`` in a thread of its own.
 
     Args:
         seconds: after which the process ends.

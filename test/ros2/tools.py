@@ -136,6 +136,9 @@ class Tools:
             tool = self.start(*words)
             with contextlib.suppress(subprocess.TimeoutExpired):
                 tool.process.wait(20.0)
+            with contextlib.suppress(subprocess.TimeoutExpired):  # killed, it may block others by shared memory
+                tool.interrupt()
+                tool.process.wait(5.0)
             kill(tool.process.pid)
             tool.process.wait()
             said = tool.text()
