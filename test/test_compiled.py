@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from patience import PATIENCE
+
 _USER = """
 from body_tracking.core.compiled import compiled
 from inner import OFFSET, inner
@@ -40,7 +42,7 @@ def run(folder: Path, cache: Path) -> str:
     # Python's own cache takes a file of the same size and second for the same
     environment = {**os.environ, "PYTHONPATH": path, "XDG_CACHE_HOME": str(cache), "PYTHONDONTWRITEBYTECODE": "1"}
     command = [sys.executable, "-c", _SCRIPT]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=True).stdout
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PATIENCE, check=True).stdout
 
 
 def write(folder: Path, offset: float = 1.0, factor: float = 1.0) -> None:

@@ -27,6 +27,7 @@ from body_tracking.recording.mcap_file import MAGIC
 from body_tracking.recording.rosbag2 import METADATA, BagError, BagReader
 from body_tracking.robot import mapping
 from draws import some
+from patience import PATIENCE
 
 BAG = Path(__file__).resolve().parent.parent / "bags" / "tpose_wave"
 SECONDS, BYTES = 2.0, 200 << 20
@@ -265,7 +266,11 @@ def test_command_ends_with_2_and_one_line(tmp_path: Path, kind: str) -> None:
         option = "--params-file" if kind == "parameters" else "--calibration"
         given = ["replay", BAG, "-o", tmp_path / "out", option, tmp_path / "bad.yaml"]
     done = subprocess.run(
-        [sys.executable, "-c", MEASURED, *map(str, given)], capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, "-c", MEASURED, *map(str, given)],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
     )
     assert done.returncode == 2, done.stderr
     (line,) = done.stderr.splitlines()

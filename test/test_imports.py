@@ -7,6 +7,8 @@ import json
 import subprocess
 import sys
 
+from patience import PATIENCE
+
 HEAVY = {"numba", "numpy", "scipy", "rclpy", "matplotlib", "rosbags"}
 ABSENT = {
     "cli": HEAVY,
@@ -33,6 +35,6 @@ def test_the_help_and_modules_that_many_processes_import_leave_out_what_they_do_
         for module in modules
     )
     script = f"import json, sys; found = {{}}; {steps}print(json.dumps(found))"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=PATIENCE, check=True)
     loaded = json.loads(done.stdout.splitlines()[-1])
     assert {module: found for module in modules if (found := ABSENT[module].intersection(loaded[module]))} == {}

@@ -27,6 +27,7 @@ from body_tracking.filters import (
 from body_tracking.filters.linear import LINEAR_MODELS, FilterError
 from body_tracking.filters.prediction import PERIOD_NS, Prediction
 from draws import draws
+from patience import PATIENCE
 from walkers import TRACKED, performed
 
 
@@ -76,7 +77,7 @@ def test_parameters_out_of_range_are_refused(parameters: type, name: str) -> Non
 def test_the_names_alone_cost_no_scipy() -> None:
     """Every node reads the table of the graph, and should start soon."""
     code = "import sys, body_tracking.pipeline.graph; assert not {'scipy.stats', 'filterpy'} & set(sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=PATIENCE)
 
 
 # --- stamps

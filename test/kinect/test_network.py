@@ -22,6 +22,7 @@ from body_tracking.kinect.kinect_sender import Sender
 from body_tracking.kinect.live import SourceSettings, open_source
 from body_tracking.kinect.network import NetworkSource, Receiver, skeleton_of
 from draws import draws
+from patience import PATIENCE
 
 START_NS = 10 * NANOSECONDS
 STRANGER = ("10.0.0.66", 666)
@@ -303,10 +304,10 @@ def key_file(folder: Path) -> str:
     return str(file)
 
 
-def read_frames(source: NetworkSource, count: int, sender: Sender, timeout: float = 20.0) -> list[int]:
+def read_frames(source: NetworkSource, count: int, sender: Sender) -> list[int]:
     """Send until so many frames were read; their stamps."""
     stamps: list[int] = []
-    end = time.monotonic() + timeout
+    end = time.monotonic() + PATIENCE
     while len(stamps) < count and time.monotonic() < end:
         sender.send(Frame(time.perf_counter_ns(), (body(), body(2, 0.5))))
         frame = source.read(0.02)
@@ -352,7 +353,7 @@ def test_a_real_sender_reaches_a_real_receiver_through_thousands_of_bad_packets(
 def test_a_sender_answers_each_request_of_its_session_once_and_no_forged_one() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.bind(("127.0.0.1", 0))
-        receiver.settimeout(0.3)
+        receiver.settimeout(PATIENCE)
         sender = Sender("kinect1", *receiver.getsockname(), KEY)
         sender.send(Frame(0, ()))
         packet, source = receiver.recvfrom(1000)
@@ -364,6 +365,7 @@ def test_a_sender_answers_each_request_of_its_session_once_and_no_forged_one() -
         answer, _ = receiver.recvfrom(1000)
         assert protocol.read_header(answer) == good._replace(kind=protocol.CLOCK_ANSWER)
         assert protocol.read_clock(answer).asked_ns == 5
+        receiver.settimeout(0.3)
         with pytest.raises(TimeoutError):
             receiver.recvfrom(1000)
         sender.close()

@@ -20,6 +20,7 @@ from body_tracking.mesh import anatomy, body_model, decimation
 from body_tracking.mesh.body_model import JOINTS, BodyModel, ModelFileError, Pose
 from body_tracking.mesh.skinning import lever_arms, vertex_normals
 from draws import some
+from patience import PATIENCE
 
 
 @pytest.fixture(scope="module")
@@ -370,5 +371,5 @@ def test_compiled_code_is_kept(tmp_path: Path) -> None:
     )
     # compiles where nothing has yet
     body_model.load().body().posed(Pose(np.tile(np.eye(3), (20, 1, 1)), np.zeros(3)))
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=PATIENCE, check=True)
     assert int(done.stdout) == 1

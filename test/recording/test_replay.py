@@ -43,6 +43,7 @@ from body_tracking.simulation.bags import write_bag
 from body_tracking.simulation.scene import Setup, simulate
 from draws import some
 from excerpts import beginning
+from patience import PATIENCE
 
 ROOT = Path(__file__).resolve().parents[2]
 BAG = ROOT / "bags" / "tpose_wave"
@@ -429,14 +430,14 @@ def test_where_one_process_is_killed_the_others_end_and_leave_no_bag(tmp_path: P
     arguments = [sys.executable, "-m", "body_tracking.cli", "replay", str(BAG), "-o", str(out)]
     reader = psutil.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
     others: list[psutil.Process] = []
-    deadline = time.monotonic() + 60.0
+    deadline = time.monotonic() + PATIENCE
     try:
         while not out.exists() or len(others) < 2:
             assert time.monotonic() < deadline
             others = reader.children(recursive=True)
             time.sleep(0.01)
         {"reader": reader, "filter": others[0], "writer": others[1]}[victim].kill()
-        _, reported = reader.communicate(timeout=60.0)
+        _, reported = reader.communicate(timeout=PATIENCE)
         while out.exists():
             assert time.monotonic() < deadline
             time.sleep(0.01)
@@ -444,7 +445,7 @@ def test_where_one_process_is_killed_the_others_end_and_leave_no_bag(tmp_path: P
         for process in (*others, reader):
             with contextlib.suppress(psutil.NoSuchProcess):
                 process.kill()
-    assert not psutil.wait_procs(others, timeout=60.0)[1]
+    assert not psutil.wait_procs(others, timeout=PATIENCE)[1]
     if victim != "reader":
         assert reader.returncode == 2, reported.decode()
         assert reported.count(b"\n") == 1

@@ -34,6 +34,7 @@ from body_tracking.recording.rosbag2 import (
     serialize,
 )
 from draws import draws
+from patience import PATIENCE
 
 HERE = Path(__file__).parent
 TYPES = get_typestore(Stores.ROS2_JAZZY)
@@ -505,7 +506,7 @@ for item in messages(20_000):
 def test_kill_9_leaves_a_bag_that_opens(tmp_path):
     process = subprocess.Popen([sys.executable, "-c", WRITE_FOREVER, str(tmp_path / "bag")], cwd=HERE)
     try:
-        until = time.monotonic() + 30
+        until = time.monotonic() + PATIENCE
         while time.monotonic() < until:
             time.sleep(0.1)
             file = tmp_path / "bag" / "bag_0.mcap"
@@ -514,7 +515,7 @@ def test_kill_9_leaves_a_bag_that_opens(tmp_path):
         process.send_signal(signal.SIGKILL)
     finally:
         process.kill()
-        process.wait(10)
+        process.wait(PATIENCE)
     found = read(tmp_path / "bag")
     assert len(found) > 100 and found == messages(len(found))
     with recover(tmp_path / "bag") as reader:
@@ -544,7 +545,7 @@ def test_a_full_disk_is_an_error_and_costs_nothing_written_before(tmp_path):
         [sys.executable, "-c", FILL_THE_DISK, str(tmp_path / "bag")],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=PATIENCE,
         cwd=HERE,
     )
     assert run.returncode == 0, run.stderr
