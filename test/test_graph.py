@@ -31,7 +31,7 @@ VARIANTS = [
     options_of(),
     options_of(sensors=("a", "b", "c"), record="somewhere"),
     options_of(bag="bag", filter="lkf_zero_velocity", calibration="c.yaml", reliable=True),
-    options_of(bag="bag", record="somewhere", rate=2.0),
+    options_of(bag="bag", record="somewhere", rate=2.0, loop=True, start=3.0),
     options_of(bag="bag", record="somewhere", filter="ekf", convention="isb"),
     options_of(filter="schlagenhauf_ekf"),
     options_of(filter="ekf", subject="all", people=3, imus=("forearm_left",)),

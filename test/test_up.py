@@ -249,6 +249,8 @@ def test_other_mistakes_on_the_command_line(capsys: pytest.CaptureFixture[str], 
     (tmp_path / "there").write_text("")
     assert "exists already" in refusal(capsys, "--bag", BAG, "--record", tmp_path / "there")
     assert "rate 0: expected" in refusal(capsys, "--bag", BAG, "--rate", "0")
+    assert "start 600: the bag lasts" in refusal(capsys, "--bag", BAG, "--start", "600")
+    assert "loop: needs a bag" in refusal(capsys, "--loop")
     assert "external" in refusal(capsys, "--bag", BAG, "--external")
     assert "cannot be read" in refusal(capsys, "--params-file", tmp_path / "nowhere.yaml")
     assert "kinect1_skeleton: nothing to read: give a bag" in refusal(capsys)

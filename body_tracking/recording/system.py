@@ -18,6 +18,7 @@ from body_tracking.pipeline.system import (
     Service,
     System,
     TopicSpec,
+    asked,
 )
 
 
@@ -46,6 +47,7 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
             "rate": options["rate"],
             "topics": options["played"],
             "reliable": options["reliable"],
+            **asked(options, loop="loop", start_offset="start"),
         },
     )
 
@@ -58,6 +60,8 @@ SYSTEM = System(
     options=(
         Option("bag", "", "play this bag instead of the sensors", "BAG", path=True),
         Option("rate", 1.0, "play the bag X times as fast (default 1)", "X"),
+        Option("loop", False, "play the bag again from the beginning at its end, until Ctrl-C"),
+        Option("start", 0.0, "skip this many seconds at the beginning of the bag", "SECONDS"),
         Option("played", (), hidden=True),
         Option("record", "", "record all topics into this new folder", "BAG", path=True, example="recording"),
         Option(

@@ -40,6 +40,7 @@ from body_tracking.robot.system import convention_of
 from body_tracking.ros import dds
 from body_tracking.systems import (
     FLOW,
+    OPTIONS,
     add_options,
     all_nodes_for,
     angles_topics,
@@ -110,14 +111,18 @@ def options_for(args: argparse.Namespace) -> Options:
     if args.external and args.bag is not None:
         raise UpError("external: cannot be combined with a bag, which is played in place of the sensors")
     if args.bag is None:
-        if args.rate != 1.0:
-            raise UpError("rate: needs a bag")
+        for name in ("rate", "loop", "start"):
+            if getattr(args, name) != OPTIONS[name].default:
+                raise UpError(f"{name}: needs a bag")
     else:
         if not 0.01 <= args.rate <= 100.0:
             raise UpError(f"rate {args.rate:g}: expected 0.01 to 100")
         with RigReader(args.bag) as reader:
             topics = frozenset(reader.topics)
             there = graph.sensors_among(reader.topics)
+            duration = (reader.end_ns - reader.start_ns) / NANOSECONDS
+        if not 0.0 <= args.start < duration:
+            raise UpError(f"start {args.start:g}: the bag lasts {duration:.1f} s")
         if not options_of(**given)["computed"]:
             given.setdefault("sensors", there)
     if args.robot is not None:
@@ -383,7 +388,7 @@ class Supervisor:
         child.due = now + BACKOFFS[min(child.deaths, len(BACKOFFS)) - 1]
         child.restarts += 1
         child.died = now
-        if playing and monitor.clock_ns:
+        if playing and monitor.clock_ns and not self.options["loop"]:  # a loop begins where it began
             child.parameters["start_offset"] = max(0.0, (monitor.clock_ns - self._bag_start_ns) / NANOSECONDS)
         how = f"killed by signal {-code}" if code < 0 else f"exit code {code}"
         self.console.line(f"{child.spec.name} died ({how}); starting it again", error=True)
