@@ -176,6 +176,19 @@ def played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
     return tuple(topic for system in SYSTEMS for topic in system.played(options, topics))
 
 
+def found_sensors(topics: Mapping[str, str]) -> dict[str, Value]:
+    """The options of a graph that takes every sensor that publishes, given the type of each topic; empty for none."""
+    found = {name: value for system in SYSTEMS for name, value in system.finds(topics).items()}
+    if found and "sensors" not in found and not any(OPTIONS[name].source for name in found):
+        found["sensors"] = ()
+    return found
+
+
+def names_sensors(options: Mapping[str, Value]) -> bool:
+    """Whether any of these options says where data come from."""
+    return any(name in ("sensors", "adapt", "imus") or OPTIONS[name].source for name in options if options[name])
+
+
 # --- the graph
 
 

@@ -56,6 +56,47 @@ def test_every_parameter_in_the_table_is_one_of_its_node(options: Options) -> No
                 assert known[name].check(value) == value
 
 
+CLOUD, IMAGES, READINGS, MARKERS = (
+    f"{package}/msg/{name}"
+    for package, name in (
+        ("sensor_msgs", "PointCloud2"),
+        ("sensor_msgs", "Image"),
+        ("sensor_msgs", "Imu"),
+        ("visualization_msgs", "MarkerArray"),
+    )
+)
+
+
+@pytest.mark.parametrize(
+    ("topics", "expected"),
+    [
+        ({"/rosout": "rcl_interfaces/msg/Log", "/fused/skeleton": CLOUD, "/imu/skeleton": CLOUD}, {}),
+        ({"/b/skeleton": CLOUD, "/a/skeleton": CLOUD}, {"sensors": ("a", "b"), "external": True}),
+        (
+            {"/a/skeleton": CLOUD, "/a/depth/image_raw": IMAGES, "/hand_left/imu/data": READINGS},
+            {"sensors": ("a",), "external": True, "imus": ("hand_left",)},
+        ),
+        (
+            {"/forearm_left/imu/data_raw": READINGS, "/pelvis/imu/data": READINGS, "/table/imu/data": READINGS},
+            {"imus": ("pelvis", "forearm_left"), "sensors": ()},
+        ),
+        ({"/k4a/body_tracking_data": MARKERS}, {"sensors": ("azure1",), "adapt": ("azure1:/k4a/body_tracking_data",)}),
+        ({"/a/color/image_raw": IMAGES, "/a/depth/image_raw": IMAGES}, {"camera": ("a",)}),
+        (
+            {"/camera/d435/color/image_raw": IMAGES, "/camera/d435/aligned_depth_to_color/image_raw": IMAGES},
+            {"camera": ("d435",), "driver": "realsense"},
+        ),
+        ({"/a/depth/image_raw": IMAGES}, {"depth": ("a",)}),
+    ],
+)
+def test_sensors_that_publish_become_options_of_a_graph(topics: dict[str, str], expected: dict[str, Any]) -> None:
+    found = systems.found_sensors(topics)
+    assert found == expected
+    if found:
+        assert systems.names_sensors(found)
+        nodes_for(options_of(**found))
+
+
 def test_a_bag_takes_the_place_of_the_sensors_and_gives_the_time() -> None:
     topics = ("/kinect1/skeleton", "/kinect2/skeleton")
     live, played = named(nodes_for(options_of())), named(nodes_for(options_of(bag="bag", record="r", played=topics)))

@@ -21,7 +21,7 @@ from draws import some
 rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
-from sensor_msgs.msg import JointState  # noqa: E402
+from sensor_msgs.msg import JointState, PointCloud2  # noqa: E402
 
 from body_tracking import cli, systems  # noqa: E402
 from body_tracking.core.parameters import (  # noqa: E402
@@ -33,6 +33,7 @@ from body_tracking.pipeline import graph  # noqa: E402
 from body_tracking.pipeline.roles import ROLES  # noqa: E402
 from body_tracking.pipeline.system import Options  # noqa: E402
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagReader, BagWriter, deserialize  # noqa: E402
+from body_tracking.ros import discovery  # noqa: E402
 from body_tracking.systems import options_of  # noqa: E402
 from domains import domain  # noqa: E402
 from spinning import spin_until  # noqa: E402
@@ -253,7 +254,7 @@ def test_other_mistakes_on_the_command_line(capsys: pytest.CaptureFixture[str], 
     assert "loop: needs a bag" in refusal(capsys, "--loop")
     assert "external" in refusal(capsys, "--bag", BAG, "--external")
     assert "cannot be read" in refusal(capsys, "--params-file", tmp_path / "nowhere.yaml")
-    assert "kinect1_skeleton: nothing to read: give a bag" in refusal(capsys)
+    assert "kinect1_skeleton: nothing to read: give a bag" in refusal(capsys, "--sensors", "kinect1")
     assert "namespace" in refusal(capsys, "--namespace", "a b", "--bag", BAG)
     assert "reserved" in refusal(capsys, "--sensors", "fused")
     assert "twice" in refusal(capsys, "--sensors", "a,a")
@@ -261,11 +262,33 @@ def test_other_mistakes_on_the_command_line(capsys: pytest.CaptureFixture[str], 
     file.write_text("joint_angles: {ros__parameters: {convention: isb, input: model_state}}")
     assert "has no model of the body" in refusal(capsys, "--filter", "lkf_zero_velocity", "--params-file", file)
     file.write_text("skeleton_filter: {ros__parameters: {input: sensors}}")
-    assert "cannot smooth" in refusal(capsys, "--filter", "thesis_lkf1", "--lag", "0.15")
+    assert "cannot smooth" in refusal(capsys, "--external", "--filter", "thesis_lkf1", "--lag", "0.15")
     robot = BAGS.parent / "config" / "robots" / "iiwa7.yaml"
     assert "must not follow angles that come late" in refusal(capsys, "--robot", robot, "--lag", "0.15")
     assert "expected 0 to 0.3" in refusal(capsys, "--bag", BAG, "--lag", "0.5")
     assert "takes fused skeletons" in refusal(capsys, "--filter", "lkf_zero_velocity", "--params-file", file)
+
+
+# --- sensors that publish
+
+
+def test_up_without_arguments_takes_the_sensors_that_publish(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain()))
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=int(os.environ["ROS_DOMAIN_ID"]))
+    node = rclpy.create_node("camera", context=context)
+    publishers = [node.create_publisher(PointCloud2, graph.skeleton_topic(name), 1) for name in ("left", "right")]
+    found = discovery.look(patience=60.0)
+    assert found == discovery.Domain({"sensors": ("left", "right"), "external": True})
+    assert not discovery.look("/elsewhere", patience=0.3).sensors
+    assert len(publishers) == 2
+    rclpy.try_shutdown(context=context)
+
+    monkeypatch.setattr(discovery, "look", lambda namespace: discovery.Domain())
+    assert "no sensor publishes in ROS domain" in refusal(capsys)
 
 
 # --- parameters

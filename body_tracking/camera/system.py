@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 
 from body_tracking.camera.topics import COMPRESSION, DRIVERS, RIG_SENSOR, CameraTopics, images_of, people_topic
-from body_tracking.core.message_types import COMPRESSED_IMAGE, POINT_CLOUD
+from body_tracking.core.message_types import COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
 from body_tracking.core.parameters import Value
 from body_tracking.core.qos import RELIABLE
 from body_tracking.markers.setup import camera_names
@@ -39,6 +39,23 @@ def _topics(options: Options, camera: str) -> CameraTopics:
 def _rig(options: Options) -> tuple[str, ...]:
     """The sensor of the cameras of a rig, where there is one."""
     return (RIG_SENSOR,) if options["camera_rig"] else ()
+
+
+def _finds(topics: Mapping[str, str]) -> dict[str, Value]:
+    """Colour-and-depth cameras of one driver, unless other cameras publish skeletons."""
+    if graph.sensors_among(topics):
+        return {}
+    for driver, each in DRIVERS.items():
+        before, _, after = each.colour.partition("{camera}")
+        found = []
+        for topic in sorted(topics):
+            camera = topic.removeprefix(before).removesuffix(after)
+            own = each.of(camera)
+            if "/" not in camera and topic == own.colour and topics[topic] == IMAGE and own.depth in topics:
+                found.append(camera)
+        if found:
+            return {"camera": tuple(found), **({} if driver == "plain" else {"driver": driver})}
+    return {}
 
 
 def _pictures(options: Options) -> dict[str, Value]:
@@ -84,6 +101,7 @@ SYSTEM = System(
     ),
     specs=_specs,
     played=_played,
+    finds=_finds,
     computes=lambda options: (*_cameras(options), *_rig(options)),
     options=(
         Option(

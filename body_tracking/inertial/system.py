@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 
+from body_tracking.core.body_model import SEGMENTS
 from body_tracking.core.message_types import IMU, POINT_CLOUD
+from body_tracking.core.parameters import Value
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.system import (
     NodeSpec,
@@ -31,12 +33,20 @@ def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
     return graph.played_imu_topics(imus if isinstance(imus, tuple) else (), topics)
 
 
+def _finds(topics: Mapping[str, str]) -> dict[str, Value]:
+    """Sensors that publish under the names of segments."""
+    there = {topic for topic, kind in topics.items() if kind == IMU}
+    worn = tuple(each for each in SEGMENTS if there.intersection(graph.imu_topics([each])[0].imu))
+    return {"imus": worn} if worn else {}
+
+
 SYSTEM = System(
     "inertial",
     order=1,
     nodes=(NodeType("imu_skeleton", Place.SENSING, "body_tracking.inertial.stage:ImuStage"),),
     specs=_specs,
     played=_played,
+    finds=_finds,
     options=(
         Option(
             "imus",

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 
-from body_tracking.core.message_types import POINT_CLOUD, TIME_REFERENCE, TRANSFORM
+from body_tracking.core.message_types import MARKERS, POINT_CLOUD, TIME_REFERENCE, TRANSFORM
 from body_tracking.core.parameters import Value
 from body_tracking.core.qos import LATCHED
 from body_tracking.core.sources import check_sensor_name
@@ -60,6 +60,25 @@ def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
     return wanted
 
 
+_AZURE = "/body_tracking_data"
+"""Ends the topic of Microsoft's driver of the Azure Kinect."""
+
+
+def _finds(topics: Mapping[str, str]) -> dict[str, Value]:
+    azure = sorted(topic for topic, kind in topics.items() if topic.endswith(_AZURE) and kind == MARKERS)
+    sensors = tuple(
+        each
+        for each in graph.sensors_among(topic for topic, kind in topics.items() if kind == POINT_CLOUD)
+        if graph.skeleton_topic(each) != graph.IMU_SKELETON
+    )
+    if sensors:
+        return {"sensors": sensors, "external": True}
+    if azure:
+        names = tuple(f"azure{number}" for number, _ in enumerate(azure, 1))
+        return {"sensors": names, "adapt": tuple(f"{name}:{topic}" for name, topic in zip(names, azure, strict=True))}
+    return {}
+
+
 def sensors_of(options: Options) -> tuple[str, ...]:
     """The cameras of a graph that see skeletons.
 
@@ -107,6 +126,7 @@ SYSTEM = System(
     ),
     specs=_specs,
     played=_played,
+    finds=_finds,
     options=(
         Option(
             "sensors",

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 
-from body_tracking.core.message_types import POINT_CLOUD
+from body_tracking.core.message_types import IMAGE, POINT_CLOUD
 from body_tracking.core.parameters import Value
 from body_tracking.core.qos import RELIABLE
 from body_tracking.mesh.topics import (
@@ -51,6 +51,17 @@ def _orientations(options: Options) -> dict[str, Value]:
     return {"orientations": segments} if segments else {}
 
 
+def _finds(topics: Mapping[str, str]) -> dict[str, Value]:
+    """Depth cameras without colour, unless other cameras publish skeletons."""
+    cameras = (topic.removeprefix("/").removesuffix(depth_topic("").removeprefix("/")) for topic in sorted(topics))
+    found = tuple(
+        each
+        for each in cameras
+        if "/" not in each and topics.get(depth_topic(each)) == IMAGE and f"/{each}/color/image_raw" not in topics
+    )
+    return {"depth": found} if found and not graph.sensors_among(topics) else {}
+
+
 def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
     wanted = tuple(topic(camera) for camera in _cameras(options) for topic in (info_topic, depth_topic))
     for topic in wanted:
@@ -65,6 +76,7 @@ SYSTEM = System(
     nodes=(NodeType("mesh_tracker", Place.IMAGES, "body_tracking.mesh.stage:MeshStage"),),
     specs=_specs,
     played=_played,
+    finds=_finds,
     computes=lambda options: tuple(map(mesh_sensor, _cameras(options))),
     options=(
         Option(

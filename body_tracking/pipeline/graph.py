@@ -25,6 +25,9 @@ from body_tracking.core.sources import check_sensor_name
 PARENT_VARIABLE = "BODY_TRACKING_SUPERVISOR"
 """Environment variable: id of the process with which a node ends."""
 
+UP_NODE = "body_tracking_up"
+"""Begins the name of the node of ``body_tracking up``."""
+
 SKELETON = SENSOR_DATA
 RELIABLE_SKELETON = Qos(reliability="reliable", depth=1000)
 """For skeletons with the parameter ``reliable``: no message is lost to a slow subscriber."""

@@ -205,6 +205,8 @@ class System:
         specs: returns the nodes that it runs for given options, without their namespace.
         played: returns which topics of a bag take the place of its sensors, given the options and the bag's topics;
             none where it has no sensors in such a graph. Raises GraphError where the bag lacks one.
+        finds: returns options with which a graph takes the sensors that publish, given the type of each topic; none
+            where no sensor of the system does.
         computes: returns the sensors whose skeletons its own nodes publish; they join those of the option ``sensors``,
             and take the place of its default.
         options, topics, services, commands, layers, views: that it adds.
@@ -216,6 +218,7 @@ class System:
     nodes: tuple[NodeType, ...] = ()
     specs: Callable[[Options], Iterable[NodeSpec]] = lambda options: ()
     played: Callable[[Options, Collection[str]], tuple[str, ...]] = lambda options, topics: ()
+    finds: Callable[[Mapping[str, str]], Mapping[str, Value]] = lambda topics: {}
     computes: Callable[[Options], tuple[str, ...]] = lambda options: ()
     options: tuple[Option, ...] = ()
     topics: tuple[TopicSpec, ...] = ()

