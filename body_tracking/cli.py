@@ -30,7 +30,7 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
         prog="body_tracking",
         description="Joint angles with standard deviations from several sensors: the live graph, "
         "and the same chain offline over recordings.",
-        epilog="body_tracking COMMAND --help prints the options of a command.",
+        epilog="body_tracking COMMAND --help prints the options of a command; body_tracking alone says what to do.",
     )
     top.add_argument("--version", action="version", version=f"body_tracking {version('body_tracking')}")
     subparsers = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
@@ -58,6 +58,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments = sys.argv[1:]
     arguments = _joined(arguments)
     try:
+        if not arguments:
+            from body_tracking.ros import advice
+
+            return advice.run()
         args = parser(arguments[0] if arguments else None).parse_args(arguments)
         code: int = args.run(args)
     except BodyTrackingError as error:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
 
 from body_tracking import cli
+from body_tracking.ros import advice
 
 ROOT = Path(__file__).resolve().parent.parent
 COMMANDS = ("import", "bag info", "replay", "calibrate", "up", "doctor", "show", "evaluate", "make-bags")
@@ -24,6 +26,39 @@ def test_every_command_has_a_help_and_is_listed(command: str, capsys: pytest.Cap
     text = capsys.readouterr().out
     assert f"usage: body_tracking {command}" in text
     assert command or all(each.split()[0] in text for each in COMMANDS)
+
+
+@pytest.fixture
+def nobody(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
+    """An empty folder, and a ROS domain without anybody."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(advice, "_domain", lambda page: [("No sensor publishes.", (f"body_tracking up{page}",))])
+    yield tmp_path
+
+
+def test_without_a_command_it_says_what_to_do_next(nobody: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def said() -> str:
+        assert cli.main([]) == 0
+        return capsys.readouterr().out
+
+    assert "Recordings that come with the package: tpose_" in said()
+    (nobody / "bags").mkdir()
+    (nobody / "bags" / "mine").symlink_to(ROOT / "bags" / "tpose_wave")
+    text = said()
+    assert "Recordings in this folder: mine." in text
+    assert "  body_tracking up --bag bags/mine" in text and "  body_tracking replay bags/mine -o mine_angles" in text
+    (nobody / "lab.yaml").write_text("kinect1_skeleton: {ros__parameters: {backend: network}}")
+    assert "  body_tracking up --params-file lab.yaml" in said()
+
+
+def test_without_ros_it_says_how_to_install_it(
+    nobody: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(advice, "find_spec", lambda name: None)
+    assert cli.main([]) == 0
+    text = capsys.readouterr().out
+    assert "pip install 'body_tracking[ros]'" in text and "body_tracking replay" in text
+    assert "body_tracking up" not in text
 
 
 def test_the_version_is_the_manifests(capsys: pytest.CaptureFixture[str]) -> None:

@@ -523,11 +523,11 @@ def _sensors_there(namespace: str) -> Mapping[str, Value]:
             "images or readings of inertial sensors. Play a recording with --bag BAG, name the sensors with "
             "--params-file FILE, or see what publishes: body_tracking doctor"
         )
-    print(f"found: {' '.join(_flags(found))}", flush=True)
+    print(f"found: {' '.join(flags(found))}", flush=True)
     return found
 
 
-def _flags(options: Mapping[str, Value]) -> Iterator[str]:
+def flags(options: Mapping[str, Value]) -> Iterator[str]:
     """As on a command line."""
     for name, value in options.items():
         values = value if isinstance(value, tuple) and name != "sensors" else (value,)

@@ -1,0 +1,38 @@
+"""The recordings of a folder, and those that come with the package."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import body_tracking
+
+
+def is_bag(path: Path) -> bool:
+    """Whether this is a rosbag2 folder, or a single mcap file."""
+    return path.suffix == ".mcap" or (path / "metadata.yaml").is_file() or any(path.glob("*.mcap"))
+
+
+def bags_in(folder: Path) -> tuple[Path, ...]:
+    """The recordings of a folder, the folder itself where it is one, and those of its folder ``bags``; newest first."""
+    try:
+        if is_bag(folder):
+            return (folder,)
+        found = [each for place in (folder, folder / "bags") if place.is_dir() for each in place.iterdir()]
+        found = [each for each in found if is_bag(each)]
+        return tuple(sorted(found, key=lambda each: (-each.stat().st_mtime, each.name)))
+    except OSError:  # a folder that may not be read, or a bag that is gone meanwhile
+        return ()
+
+
+def shipped_bags() -> tuple[Path, ...]:
+    """The recordings of the repository or of the installed package."""
+    beside = Path(body_tracking.__file__).parents[1]
+    places = (beside, *(each / "share" / "body_tracking" for each in (Path(sys.prefix), *beside.parents)))
+    found = next((place / "bags" for place in places if (place / "bags").is_dir()), None)
+    return () if found is None else tuple(sorted(filter(is_bag, found.iterdir()), key=_rank))
+
+
+def _rank(bag: Path) -> tuple[bool, str]:
+    """Those of skeletons first, for which nothing else is needed."""
+    return not bag.name.startswith("tpose"), bag.name

@@ -1,0 +1,107 @@
+"""``body_tracking`` without a command: says what to do next, by what is here: ROS, sensors, a graph, recordings."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Final, TypeAlias
+
+from body_tracking.ros import dds
+from body_tracking.ros.up import flags
+
+_PATIENCE: Final = 1.5
+"""Seconds for sensors to be discovered."""
+_SHOWN: Final = 3
+"""Recordings that are named at most."""
+
+Step: TypeAlias = tuple[str, tuple[str, ...]]
+"""What is here, and commands for it."""
+
+
+def steps(folder: Path) -> Iterator[Step]:
+    """What can be done in a folder, the most likely first."""
+    page = " --viewer" if find_spec("viser") is not None else ""
+    if find_spec("rclpy") is None:
+        ways = ("pip install 'body_tracking[ros]'", ". /opt/ros/jazzy/setup.bash")
+        yield "The client library of ROS is not here, so no graph can run. Install it, or source a ROS install:", ways
+        yield from _recordings(folder, page, live=False)
+        return
+    yield from _domain(page)
+    for file in sorted(folder.glob("*.yaml")):
+        if _has_sensors(file):
+            yield (
+                f"{file.name} names sensors. Start the graph with them:",
+                (f"body_tracking up --params-file {file.name}{page}",),
+            )
+    yield from _recordings(folder, page, live=True)
+    if not page:
+        yield "The live page in a browser needs viser:", ("pip install 'body_tracking[viewer]'",)
+
+
+def _domain(page: str) -> Iterator[Step]:
+    """What publishes in the ROS domain."""
+    from body_tracking.ros.discovery import look
+
+    dds.stay_on_this_machine()
+    dds.prepare()
+    found = look(patience=_PATIENCE)
+    if found.runs:
+        yield (
+            "A graph runs. Look at it, or find out what is wrong with it:",
+            (
+                "ros2 topic echo /humans/bodies/body1/joint_states",
+                "body_tracking doctor",
+            ),
+        )
+    elif found.sensors:
+        yield (
+            f"Sensors publish ({' '.join(flags(found.sensors))}). Start the graph with them:",
+            (f"body_tracking up{page}",),
+        )
+    else:
+        name = os.environ.get("ROS_DOMAIN_ID") or "0"
+        yield (
+            f"No sensor publishes in ROS domain {name}. Once yours do, start the graph with them:",
+            (f"body_tracking up{page}",),
+        )
+
+
+def _has_sensors(file: Path) -> bool:
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, ValueError):
+        return False
+    return "ros__parameters" in text and "_skeleton:" in text and ("backend:" in text or "file:" in text)
+
+
+def _recordings(folder: Path, page: str, *, live: bool) -> Iterator[Step]:
+    from body_tracking.recording.finding import bags_in, shipped_bags
+
+    own = bags_in(folder)
+    bags = own or shipped_bags()
+    if not bags:
+        return
+    where = "in this folder" if own else "that come with the package"
+    names = [each.name for each in bags[:_SHOWN]]
+    more = f" and {len(bags) - _SHOWN} more" if len(bags) > _SHOWN else ""
+    first = bags[0].relative_to(folder) if bags[0] != folder and bags[0].is_relative_to(folder) else bags[0]
+    commands = [f"body_tracking up --bag {first}{page}"] if live else []
+    out = f"{first.stem}_angles"
+    yield (
+        f"Recordings {where}: {', '.join(names)}{more}. Play one, or compute its angles offline:",
+        (
+            *commands,
+            f"body_tracking replay {first} -o {out}",
+        ),
+    )
+
+
+def run() -> int:
+    """``body_tracking`` alone."""
+    print("body_tracking: joint angles with standard deviations from several sensors\n", flush=True)
+    for text, commands in steps(Path.cwd()):
+        print(text, *(f"  {each}" for each in commands), "", sep="\n", flush=True)
+    print("All commands: body_tracking --help")
+    return 0
