@@ -69,6 +69,7 @@ setup(
         "camera": ["ai-edge-litert>=1.2"],
         "viewer": ["viser>=1.1,<2", "trimesh>=3.21.7", "websockets>=14"],
         "test": [
+            "build>=1",
             "pytest>=8",
             "pytest-xdist>=3.6",
             "hypothesis>=6.100",

@@ -3,4 +3,4 @@
 The library (every module but ``nodes`` and ``messages``) knows neither rclpy nor any message package.
 """
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

@@ -8,16 +8,19 @@ import re
 import shutil
 import subprocess
 import sys
+import tarfile
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+import yaml
 
 import body_tracking
 from body_tracking import systems
 from body_tracking.pipeline import graph
+from domains import domain
 
 ROOT = Path(__file__).resolve().parent.parent
 SHARED_FOLDERS = ("config", "launch", "rviz", "foxglove", "bags")
@@ -103,6 +106,11 @@ def test_package_xml_is_a_valid_format_3_manifest() -> None:
 def test_version_is_the_same_everywhere(manifest: ElementTree.Element, wheel: Path) -> None:
     assert manifest.findtext("version") == body_tracking.__version__
     assert wheel.name.split("-")[1] == body_tracking.__version__
+    changelog = pytest.importorskip("catkin_pkg.changelog").get_changelog_from_path(str(ROOT))
+    version, date, _ = next(iter(changelog.foreach_version(reverse=True)))
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert version == citation["version"] == body_tracking.__version__
+    assert date.date() == citation["date-released"]
 
 
 def imports() -> Iterator[tuple[str, str]]:
@@ -173,6 +181,41 @@ def test_wheel_installs_all_modules_and_share_files(wheel: Path, tmp_path: Path)
 def check_shared(share: Path) -> None:
     for folder in SHARED_FOLDERS:
         assert files_under(share / folder) == files_under(ROOT / folder), folder
+
+
+@pytest.mark.slow
+def test_sdist_and_the_wheel_from_it_play_a_shipped_recording(tmp_path: Path) -> None:
+    """As a user has it: built by ``python -m build``, which makes the wheel from the sdist, and installed anew."""
+    pytest.importorskip("rclpy")
+    pytest.importorskip("build")
+    clone = tmp_path / "clone"
+    files = run("git", "ls-files", "-z", cwd=ROOT).stdout.split("\0")
+    for name in filter(None, files):
+        (clone / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, clone / name)
+    run(sys.executable, "-m", "build", "--no-isolation", "--outdir", tmp_path / "dist", clone, cwd=tmp_path)
+    (sdist,) = (tmp_path / "dist").glob("*.tar.gz")
+    (wheel,) = (tmp_path / "dist").glob("*.whl")
+    with tarfile.open(sdist) as archive:
+        packed = {name.partition("/")[2] for name in archive.getnames()}
+    assert {"CHANGELOG.rst", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", "README.md"} <= packed
+    # An environment of its own, with the libraries of this one behind what is installed into it.
+    environment = tmp_path / "environment"
+    run(sys.executable, "-m", "venv", "--without-pip", environment, cwd=tmp_path)
+    (site,) = environment.glob("lib/python3*/site-packages")
+    run(sys.executable, "-m", "pip", "--python", environment / "bin" / "python", "install", "--quiet", "--no-index",
+        "--no-deps", wheel, cwd=tmp_path)  # fmt: skip
+    (site / "libraries.pth").write_text("".join(f"{path}\n" for path in sys.path if path.endswith("-packages")))
+    share = environment / "share" / "body_tracking"
+    check_shared(share)
+    command, recording = environment / "bin" / "body_tracking", tmp_path / "recording"
+    domain_id = {"ROS_DOMAIN_ID": str(domain()), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    env = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | domain_id
+    bag = share / "bags" / "tpose_wave"
+    run(command, "up", "--bag", bag, "--rate", "2", "--record", recording, cwd=tmp_path, env=env)
+    assert "elbow_flexion_left" in run(command, "show", recording, cwd=tmp_path, env=env).stdout
+    where = "import body_tracking; print(body_tracking.__file__)"
+    assert run(environment / "bin" / "python", "-c", where, cwd=tmp_path, env=env).stdout.startswith(str(site))
 
 
 # --- colcon
