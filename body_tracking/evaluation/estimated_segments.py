@@ -9,8 +9,10 @@ from typing import Final
 import numpy as np
 
 from body_tracking.core.body_model import SEGMENTS
+from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.joint_angles import JointAngles
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, IntArray
+from body_tracking.evaluation.hand_eye import Track
 from body_tracking.evaluation.reading import (
     AngleSeries,
     EvaluationError,
@@ -57,6 +59,11 @@ class EstimatedSegments:
         """(n,) s since the first instant."""
         seconds: FloatArray = (self.stamps_ns - self.stamps_ns[0]) / NANOSECONDS
         return seconds
+
+    def track(self, rotations: FloatArray) -> Track:
+        """Rotations (n, 3, 3) at the own instants; those at which one is unknown are absent."""
+        whole = np.isfinite(rotations).all(axis=(-1, -2))
+        return Track(self.seconds[whole], rotations[whole], np.zeros((int(whole.sum()), 3, 3)))
 
 
 def read_segments(path: Path, topic: str | None = None, body: str | None = None) -> EstimatedSegments:
@@ -124,6 +131,33 @@ def read_segments(path: Path, topic: str | None = None, body: str | None = None)
         )
         angles, name = AngleSeries(stamps, names, position, stddev), "model"
     return EstimatedSegments(path, topic, stamps, rotations, angles, name, tuple(warnings))
+
+
+def read_true_segments(path: Path) -> EstimatedSegments | None:
+    """The true segments and angles, of the convention ``model`` and with deviations of zero, in a simulated bag.
+
+    Raises:
+        BagError: no such bag, or it is unreadable.
+
+    Returns:
+        None without a true state of the model.
+    """
+    model = UpperBody()
+    with RigReader(path) as bag:
+        state = read_joint_states(bag, graph.TRUE_MODEL_STATE, "")
+        warnings = bag.warnings
+    if state is None or state.names != model.coordinate_names:
+        return None
+    q, lengths = model.integrate(model.neutral(), state.position), model.default_lengths()
+    exact, still = np.zeros((2 * model.nv, 2 * model.nv)), np.zeros(model.nv)
+    series: list[JointAngles] = []
+    for stamp_ns, each in zip(state.stamps_ns.tolist(), q, strict=True):
+        estimate = ModelEstimate(stamp_ns, "world", 0, each, still, exact, lengths, np.zeros_like(lengths))
+        series.append(angles_of(estimate, model, "model", series[-1] if series else None))
+    position = np.stack([each.position for each in series])
+    angles = AngleSeries(state.stamps_ns, series[0].names, position, np.zeros_like(position))
+    rotations = model.forward(q, lengths).rotations
+    return EstimatedSegments(path, graph.TRUE_MODEL_STATE, state.stamps_ns, rotations, angles, "model", tuple(warnings))
 
 
 def _convention_of(names: tuple[str, ...], model: UpperBody) -> str | None:

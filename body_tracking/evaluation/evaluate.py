@@ -16,10 +16,12 @@ from body_tracking.evaluation.marker_reference import (
     read_marker_reference,
     save_mountings,
 )
+from body_tracking.evaluation.mutual_comparison import compare_estimates
 from body_tracking.evaluation.pictures import pictures, reference_pictures
 from body_tracking.evaluation.reading import EvaluationError, Recorded, read_estimate, read_markers, read_truth
 from body_tracking.evaluation.reference_comparison import ReferenceEvaluation, evaluate_by_markers
 from body_tracking.evaluation.report import make_folder, report_of, write
+from body_tracking.pipeline import graph
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rig import RigReader
 
@@ -55,8 +57,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--truth",
         type=Path,
         metavar="TRUTH",
-        help="a bag with /ground_truth/skeleton (default: EST itself), a C3D file with Plug-in Gait's markers, or a "
-        "recording of the marker system, with poses of targets",
+        help="a bag with /ground_truth/skeleton (default: EST itself), a C3D file with Plug-in Gait's markers, a "
+        "recording of the marker system, with poses of targets, or another estimate of the same person",
     )
     parser.add_argument("--topic", help="the skeletons to compare (default: /filtered/skeleton, else /fused/skeleton)")
     parser.add_argument(
@@ -119,6 +121,15 @@ def _by_markers(args: argparse.Namespace) -> bool:
     return found
 
 
+def _by_estimate(args: argparse.Namespace) -> bool:
+    """Whether the truth is a bag that has estimates and no ground truth."""
+    if args.truth is None or args.truth.suffix.lower() == ".c3d":
+        return False
+    with RigReader(args.truth) as bag:
+        estimated = any(topic in bag.topics for topic in (graph.MODEL_STATE, graph.FILTERED, graph.FUSED))
+        return estimated and graph.TRUE_SKELETON not in bag.topics
+
+
 def _judge_by_markers(args: argparse.Namespace) -> ReferenceEvaluation:
     for name in ("subject", "measurements"):
         if getattr(args, name) is not None:
@@ -136,6 +147,9 @@ def run(args: argparse.Namespace) -> int:
         judged = _judge_by_markers(args)
         report = reference_report.report_of(judged)
         draw: Callable[[], list[tuple[str, str]]] = partial(reference_pictures, judged.curves)
+    elif _by_estimate(args):
+        mutual = compare_estimates(read_segments(args.estimate, args.topic, args.body), read_segments(args.truth))
+        report, draw = reference_report.mutual_report_of(mutual), list
     else:
         result = _compare(args)
         report, draw = report_of(result), partial(pictures, result)

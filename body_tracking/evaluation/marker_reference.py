@@ -58,9 +58,14 @@ class MarkerReference:
         return float(np.median(known)) if len(known) else float("nan")
 
 
+def has_targets(bag: BagReader) -> bool:
+    """Whether a recording has poses of targets."""
+    return bool(_targets(bag))
+
+
 def is_marker_reference(bag: BagReader) -> bool:
     """Whether a recording has poses of targets and no ground truth."""
-    return bool(_targets(bag)) and graph.TRUE_SKELETON not in bag.topics
+    return has_targets(bag) and graph.TRUE_SKELETON not in bag.topics
 
 
 def _targets(bag: BagReader) -> tuple[str, ...]:

@@ -21,21 +21,17 @@ from body_tracking.core.orientation import SEGMENT_NUMBER
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
 from body_tracking.evaluation.comparison import AngleComparison
 from body_tracking.evaluation.estimated_segments import EstimatedSegments, joint_chains, split_near
-from body_tracking.evaluation.hand_eye import HandEye, HandEyeError, Mounting, Track, fit_hand_eye
+from body_tracking.evaluation.hand_eye import HandEye, HandEyeError, Mounting, fit_hand_eye
 from body_tracking.evaluation.marker_reference import MarkerReference
 from body_tracking.evaluation.metrics import angle_errors, wrapped
 from body_tracking.evaluation.reading import EvaluationError
 from body_tracking.evaluation.reference_error import Differences, Judged, judge
-from body_tracking.inertial.clock import clock_offset, turning
+from body_tracking.evaluation.start_clock import start_clock
 from body_tracking.kinematics.conventions import Chain
 from body_tracking.kinematics.upper_body import PARENTS, UpperBody
 
 LEAST_OVERLAP: Final = 10.0
 """Seconds that both recordings must cover."""
-_SAME_CLOCK: Final = 1.0
-"""Seconds: half width of the search where the stamps are taken to be of one clock."""
-_AGREE: Final = 0.1
-"""Seconds by which the offsets of two segments may differ; speeds of skin and bone differ, too."""
 _AMPLIFIED: Final = 10.0
 """Near a singular pose: an angle that changes by more than this per radian of rotation is not compared."""
 _WORLD: Final = "world"
@@ -175,56 +171,11 @@ def _start_clock(
     estimate: EstimatedSegments, reference: MarkerReference, rotations: FloatArray, targets: Sequence[str]
 ) -> tuple[ClockModel, list[str]]:
     """The targets' clock against the estimate's, both from their first stamps, by the angular speeds; and notes."""
-    times = estimate.seconds
-    length, other = float(times[-1]), max(float(track.times[-1]) for track in reference.tracks.values())
+    own = {target: estimate.track(rotations[:, number]) for number, target in enumerate(targets)}
     apart = (int(estimate.stamps_ns[0]) - reference.first_ns) / NANOSECONDS
-    searches = [(0.5 * (other - length), 0.5 * (other + length))]
-    if -other < -apart < length:
-        searches.append((apart, _SAME_CLOCK))
-    series = []
-    for number, target in enumerate(targets):
-        track = reference.tracks[target]
-        whole = np.isfinite(rotations[:, number]).all(axis=(-1, -2))
-        own = Track(times[whole], rotations[whole, number], np.zeros((int(whole.sum()), 3, 3)))
-        series.append([turning(each.times, np.linalg.norm(each.rates(each.times), axis=1)) for each in (own, track)])
-    for attempt, (guess, window) in enumerate(searches):
-        found = {
-            target: clock
-            for target, (mine, theirs) in zip(targets, series, strict=True)
-            if (clock := clock_offset(mine, theirs, guess, window)) is not None
-        }
-        if not found:
-            continue
-        best = min(found, key=lambda target: found[target].stddev)
-        notes = []
-        if attempt:
-            notes.append(
-                f"the movement alone does not tell the clocks' offset, as it repeats itself or is small: it was sought "
-                f"within {_SAME_CLOCK:g} s of that by the stamps"
-            )
-        for target, clock in found.items():
-            if abs(clock.offset - found[best].offset) > _AGREE:
-                notes.append(
-                    f"the angular speed of {target} puts the clocks {clock.offset - found[best].offset:+.2f} s from "
-                    f"where {best} does: is it on {reference.segments[target]}?"
-                )
-        missing = [target for target in targets if target not in found]
-        if missing:
-            notes.append(f"the clocks' offset is not told by {', '.join(missing)}, which move little or unlike")
-        return found[best], notes
-    rms = ", ".join(
-        f"{target} {np.degrees(_rms(theirs.values)):.0f}, its segment {np.degrees(_rms(mine.values)):.0f}"
-        for target, (mine, theirs) in zip(targets, series, strict=True)
-    )
-    raise EvaluationError(
-        f"{estimate.source} ({length:.1f} s) and {reference.source} ({other:.1f} s): no segment's angular speed "
-        f"determines the offset of their clocks (deg/s RMS: {rms}); too little movement, or one that repeats itself, "
-        "or another one"
-    )
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt((values**2).mean())) if values.size else 0.0
+    length, other = float(estimate.seconds[-1]), max(float(track.times[-1]) for track in reference.tracks.values())
+    sources = f"{estimate.source} ({length:.1f} s) and {reference.source} ({other:.1f} s)"
+    return start_clock(own, reference.tracks, apart, sources, reference.segments)
 
 
 # --- differences

@@ -1,10 +1,11 @@
-"""The report of what :mod:`body_tracking.evaluation.reference_comparison` finds."""
+"""The reports of evaluations by a reference that errs itself: the marker system, or another estimate."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from body_tracking.core.skeleton import NANOSECONDS
+from body_tracking.evaluation.mutual_comparison import MutualComparison
 from body_tracking.evaluation.reference_comparison import ReferenceEvaluation
 from body_tracking.evaluation.reference_error import Judged
 from body_tracking.evaluation.report import Column, Report, Table, numbered
@@ -67,6 +68,48 @@ def tables(result: ReferenceEvaluation) -> tuple[Table, ...]:
         )
     )
     return tuple(made)
+
+
+def mutual_report_of(result: MutualComparison) -> Report:
+    """The report of an evaluation by another estimate."""
+    estimate, reference = result.estimate, result.reference
+    known = not np.isnan(result.clock_stddev)
+    clock = f"{1e3 * result.offset_s:+.1f} +- {1e3 * result.clock_stddev:.1f} ms" if known else "as the stamps are"
+    facts = (
+        ("estimate", f"{estimate.source} {estimate.topic}: {len(estimate.stamps_ns)} frames"),
+        ("reference", f"{reference.source} {reference.topic}: {len(reference.stamps_ns)} frames, another estimate"),
+        ("compared", f"{result.seconds:.2f} s"),
+        ("clock", f"the reference's minus the estimate's {clock}"),
+        ("all", f"RMS difference {np.degrees(result.measured):.1f} deg, {100.0 * result.covered:.0f} % of them in 95%"),
+        *(("note", note) for note in (*result.notes, *_notes(result))),
+    )
+    content = {
+        "estimate": str(estimate.source),
+        "reference": str(reference.source),
+        "convention": estimate.convention,
+        "compared_s": numbered(result.seconds),
+        "clock": {"offset_ms": numbered(1e3 * result.offset_s), "stddev_ms": numbered(1e3 * result.clock_stddev)},
+        "difference_deg": numbered(float(np.degrees(result.measured))),
+        "covered": numbered(result.covered),
+        "too_poor": [each.name for each in result.angles if each.too_poor],
+        "notes": list(result.notes),
+    }
+    note = f"{_MUTUAL}\n{_OFFSET}\n{_COVERED}"
+    table = _judged_table("reference_angles", f"angles ({estimate.convention})", result.angles, True, note)
+    return Report(f"{estimate.source.name}: accuracy by {reference.source.name}", facts, content, (table,))
+
+
+_MUTUAL = (
+    "difference: RMS of estimate minus reference. reference: RMS deviation that the reference states of itself.\n"
+    "error: the difference without that, in quadrature, and its 95 % interval; - where the reference is too poor."
+)
+
+
+def _notes(result: MutualComparison) -> tuple[str, ...]:
+    poor = [each.name for each in result.angles if each.too_poor]
+    if not poor:
+        return ()
+    return (f"the reference is too poor for {', '.join(poor)}: its own deviation is not below half of the difference",)
 
 
 def report_of(result: ReferenceEvaluation) -> Report:

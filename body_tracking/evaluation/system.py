@@ -11,6 +11,11 @@ SYSTEM = System(
         Command("show", "body_tracking.evaluation.show", "show the joint angles in a recording"),
         Command("evaluate", "body_tracking.evaluation.evaluate", "compare a recording's estimates with the truth"),
         Command(
+            "compare",
+            "body_tracking.evaluation.compare",
+            "compare every system that recorded a person with every other one",
+        ),
+        Command(
             "evaluate baseline",
             "body_tracking.evaluation.baseline",
             "test a camera: a robot arm with red balls, or a pendulum's frequency",

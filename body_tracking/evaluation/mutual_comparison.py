@@ -1,0 +1,169 @@
+"""Compares two estimates of one person by their joint angles, each counted with the deviation that it states.
+
+Joint angles depend on neither frame, so that only the clocks are aligned, by how fast the segments turn
+(:mod:`body_tracking.evaluation.start_clock`). The difference of two angles with deviations a and b has the deviation
+sqrt(a^2 + b^2); with one estimate as the reference of the other, :mod:`body_tracking.evaluation.reference_error` says
+how large the other one's own error is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from body_tracking.core.body_model import SEGMENTS
+from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray
+from body_tracking.evaluation.estimated_segments import EstimatedSegments
+from body_tracking.evaluation.hand_eye import MAX_GAP
+from body_tracking.evaluation.metrics import wrapped
+from body_tracking.evaluation.reading import AngleSeries, EvaluationError
+from body_tracking.evaluation.reference_error import Differences, Judged, judge
+from body_tracking.evaluation.start_clock import start_clock
+
+USABLE: Final = float(np.radians(30.0))
+"""Radians: an angle with a larger deviation counts as unknown. A robot that follows angles stops far below it."""
+LEAST_OVERLAP: Final = 2.0
+"""Seconds that both recordings must cover."""
+_NORMAL: Final = 1.96
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MutualComparison:
+    """Two estimates of one person.
+
+    Attributes:
+        estimate: the one that is judged.
+        reference: the one by which it is judged.
+        offset_s: the reference's clock minus the estimate's.
+        clock_stddev: s, of that; NaN where the movement does not determine it and the stamps are taken as they are.
+        seconds: that both cover.
+        angles: of the convention of both, where both know one.
+        measured: radians, RMS difference of all these together.
+        covered: share of all differences within 1.96 of the deviation that both state.
+        notes: a line each.
+    """
+
+    estimate: EstimatedSegments
+    reference: EstimatedSegments
+    offset_s: float
+    clock_stddev: float
+    seconds: float
+    angles: tuple[Judged, ...]
+    measured: float
+    covered: float
+    notes: tuple[str, ...]
+
+
+def compare_estimates(estimate: EstimatedSegments, reference: EstimatedSegments) -> MutualComparison:
+    """Judge an estimate by another one of the same person.
+
+    Raises:
+        EvaluationError: angles of different conventions, or too little overlap.
+    """
+    both = f"{estimate.source} and {reference.source}"
+    if estimate.convention != reference.convention:
+        raise EvaluationError(
+            f"{both}: angles of the conventions {estimate.convention} and {reference.convention}; replay both with "
+            "the same --convention"
+        )
+    offset, stddev, notes = _clock(estimate, reference, both)
+    times = estimate.seconds
+    at = times + offset - (int(reference.stamps_ns[0]) - int(estimate.stamps_ns[0])) / NANOSECONDS
+    inside = (at >= 0.0) & (at <= reference.seconds[-1])
+    seconds = float(np.ptp(times[inside])) if inside.any() else 0.0
+    if seconds < LEAST_OVERLAP:
+        raise EvaluationError(f"{both}: {seconds:.1f} s in common, {LEAST_OVERLAP:g} s are needed")
+    stamps_ns = estimate.stamps_ns[inside]
+    own = _at(estimate.angles, (stamps_ns - estimate.angles.stamps_ns[0]) / NANOSECONDS)
+    other = _at(reference.angles, at[inside] + _lead(reference))
+    shared = [name for name in estimate.angles.names if name in reference.angles.names]
+    mine, theirs = ([series.names.index(name) for name in shared] for series in (estimate.angles, reference.angles))
+    errors = wrapped(own.position[:, mine] - other.position[:, theirs])
+    variance = other.stddev[:, theirs] ** 2
+    # an error of the clock is one of the angle in proportion to its rate
+    step = float(np.median(np.diff(times)))
+    rates = np.gradient(np.unwrap(other.position[:, theirs], axis=0), step, axis=0)
+    variance = variance + (np.nan_to_num(stddev) * rates) ** 2
+    stated = own.stddev[:, mine]
+    known = (stated < USABLE) & (other.stddev[:, theirs] < USABLE)
+    half: BoolArray = times[inside] < times[inside].mean()
+    judged = [
+        judge(
+            name,
+            [_differences(errors, variance, stated, known[:, k] & part, k, step) for part in (half, ~half)],
+            mountings_known=True,
+        )
+        for k, name in enumerate(shared)
+    ]
+    if not known.any():
+        raise EvaluationError(f"{both}: there is no angle that both know to {np.degrees(USABLE):.0f} degrees")
+    within = np.abs(errors) < _NORMAL * np.sqrt(variance + stated**2)
+    return MutualComparison(
+        estimate,
+        reference,
+        offset,
+        stddev,
+        seconds,
+        tuple(each for each in judged if each is not None),
+        float(np.sqrt((errors[known] ** 2).mean())),
+        float(within[known].mean()),
+        (*estimate.warnings, *reference.warnings, *notes),
+    )
+
+
+def _lead(reference: EstimatedSegments) -> float:
+    """Seconds from the first stamp of the angles to that of the segments."""
+    return float(reference.stamps_ns[0] - reference.angles.stamps_ns[0]) / NANOSECONDS
+
+
+def _differences(
+    errors: FloatArray, variance: FloatArray, stated: FloatArray, which: BoolArray, column: int, step: float
+) -> Differences:
+    count = int(which.sum())
+    return Differences(
+        step,
+        errors[which, column, None],
+        variance[which, column],
+        np.zeros((count, 1, 1)),
+        stated[which, column],
+    )
+
+
+def _clock(estimate: EstimatedSegments, reference: EstimatedSegments, both: str) -> tuple[float, float, list[str]]:
+    """The reference's clock minus the estimate's and its deviation, seconds, and notes."""
+    apart = float(int(estimate.stamps_ns[0]) - int(reference.stamps_ns[0])) / NANOSECONDS
+    own, other = (
+        {name: each.track(each.rotations[:, number]) for number, name in enumerate(SEGMENTS)}
+        for each in (estimate, reference)
+    )
+    there = [name for name in SEGMENTS if min(len(own[name].times), len(other[name].times)) > 1]
+    own, other = ({name: each[name] for name in there} for each in (own, other))
+    try:
+        clock, _ = start_clock(own, other, apart, both, {name: name for name in there})
+    except (EvaluationError, ValueError) as error:
+        if not -estimate.seconds[-1] < apart < reference.seconds[-1]:
+            raise EvaluationError(f"{both}: their stamps do not overlap, and {error}") from error
+        return (
+            0.0,
+            float("nan"),
+            ["the movement does not determine the clocks' offset; the stamps are taken as they are"],
+        )
+    middle_ns = round(0.5 * float(estimate.seconds[-1]) * NANOSECONDS)
+    return clock.offset_ns_at(middle_ns) / NANOSECONDS - apart, clock.stddev, []
+
+
+def _at(series: AngleSeries, times: FloatArray) -> AngleSeries:
+    """Angles at (n,) seconds since their first stamp, interpolated; infinite deviations in gaps."""
+    stamps = (series.stamps_ns - series.stamps_ns[0]) / NANOSECONDS
+    after = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
+    before = after - 1
+    gap = stamps[after] - stamps[before]
+    share = np.clip((times - stamps[before]) / gap, 0.0, 1.0)[:, None]
+    step = wrapped(series.position[after] - series.position[before])
+    stddev = np.maximum(series.stddev[before], series.stddev[after])
+    inside = (times >= stamps[0] - 1e-6) & (times <= stamps[-1] + 1e-6) & (gap <= MAX_GAP)
+    stddev = np.where(inside[:, None] & np.isfinite(step), stddev, np.inf)
+    position = np.nan_to_num(series.position[before] + share * step)
+    return AngleSeries((times * NANOSECONDS).astype(np.int64), series.names, position, stddev)
