@@ -278,7 +278,8 @@ def _model(model: UpperBody) -> Convention:
             (f"shoulder_flexion_{side}", f"shoulder_abduction_{side}", f"shoulder_rotation_{side}"),
             f"clavicle_{side}",
             f"upper_arm_{side}",
-            EulerAngles(SHOULDER_AXES[side], SHOULDER_USUAL),
+            # its singular pose is the T-pose, after which the angles must be those of an arm in front of the body
+            EulerAngles(SHOULDER_AXES[side], SHOULDER_USUAL, margin=30.0),
         )
         for side in _SIDES
     ]

@@ -36,14 +36,14 @@ MIN_HOLD = np.radians(0.1)
 """Radians: lower bound of a rotation's standard deviation, so that rounding errors decide no angle."""
 MAX_HOLD = np.radians(4.0)
 """Radians: upper bound, so that 20 deg away from a singular pose even an unobserved rotation has its own angles."""
-MARGIN = np.radians(60.0)
-"""Radians by which an angle may leave its usual range for the sake of continuity, before it jumps back.
+WHOLE_MARGIN = np.radians(60.0)
+"""Radians by which an angle may leave its usual range for the sake of continuity, before it jumps by a full turn."""
+_SURE = np.radians(20.0)
+"""Standard deviation of the rotation about the last axis at which the last angle's range counts half.
 
-A continuous path through singular poses can end in angles such as -180, 180, 180 deg for hanging arms. An arm that
-swings back through hanging needs 60 deg (extension).
+The direction that the first two angles are is usually better known: a straight arm that noise has rotated beyond its
+range is not to have its direction reversed.
 """
-_ANNOUNCED = np.radians(40.0)
-"""Radians beyond its usual range from which an angle is the less certain the nearer the jump at :data:`MARGIN` is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,11 +54,17 @@ class EulerAngles:
         axes: the three axes, each along an axis of the frame, the second perpendicular to both others.
         usual: degrees, (least, greatest) of the three angles, to choose among equivalent triples.
         turn: (3, 3) ``R @ turn`` is decomposed instead of R. None for the identity.
+        margin: degrees by which the three angles may leave their usual ranges farther, in the sum, than the equivalent
+            triple does, for the sake of continuity, before they jump to that one; from half of it on they are the less
+            certain the nearer the jump is. A continuous path around a singular pose can end in angles such as -180,
+            180, 180 deg for hanging arms: noise decides on which side of the pose an arm passes. Where hanging is the
+            singular pose, an arm that swings back through it needs 60 deg (extension).
     """
 
     axes: tuple[FloatArray, FloatArray, FloatArray]
     usual: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
     turn: FloatArray | None = None
+    margin: float = 60.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,6 +108,7 @@ class EulerSequences:
         usual = np.radians([sequence.usual for sequence in sequences])
         self._low, self._high = usual[..., 0], usual[..., 1]
         self._centre = 0.5 * (self._low + self._high)
+        self._margin = np.radians([sequence.margin for sequence in sequences])
 
     def split(self, rotations: FloatArray, variances: FloatArray, previous: FloatArray | None) -> Split:
         """Angles of rotations.
@@ -140,33 +147,45 @@ class EulerSequences:
         )
         angles[..., 1] = b + self._offset
         angles[..., 2] = self._sign * c
-        chosen, best = self._choose(angles, previous)
+        # of a small rotation about the last axis
+        last = ((self._pre.swapaxes(-1, -2) @ r[:, :, :1])[..., 0] ** 2 * variances).sum(axis=-1)
+        chosen, best, beyond = self._choose(angles, previous, _SURE**2 / (_SURE**2 + last))
         derivatives = self._derivatives(np.where(best, parts[:, 0], parts[:, 1]), distance, hold)
-        beyond = self._excess(chosen)[:, :2].max(axis=1) - _ANNOUNCED
-        return Split(chosen, *derivatives, np.clip(beyond / (MARGIN - _ANNOUNCED), 0.0, 1.0))
+        return Split(chosen, *derivatives, np.clip(2.0 * beyond / self._margin - 1.0, 0.0, 1.0))
 
-    def _choose(self, angles: FloatArray, previous: FloatArray | None) -> tuple[FloatArray, BoolArray]:
-        """(n, 3) the better of (2, n, 3) solutions, with their full turns, and (n,) whether it is the first.
+    def _choose(
+        self, angles: FloatArray, previous: FloatArray | None, weight: FloatArray
+    ) -> tuple[FloatArray, BoolArray, FloatArray]:
+        """The better of two solutions.
 
-        The last angle's range does not choose: the direction that the first two are is better known, and a straight arm
-        that noise has rotated beyond its range is not to have its direction reversed.
+        Args:
+            angles: (2, n, 3) both, without full turns.
+            previous: (n, 3) to stay near to, or None.
+            weight: (n,) of the last angle's range.
+
+        Returns:
+            (n, 3) angles; (n,) whether they are the first solution; and (n,) radians by which they leave their usual
+            ranges farther than the other solution.
         """
         near = self._centre if previous is None else previous
         angles = angles + _TURN * np.rint((near - angles) / _TURN)
-        if previous is None:
-            cost = np.abs(angles) + 100.0 * self._excess(angles)
-        else:
+        excess = self._excess(angles)
+        if previous is not None and excess.max() > WHOLE_MARGIN:
+            usual = angles + _TURN * np.rint((self._centre - angles) / _TURN)
+            angles = np.where(excess > WHOLE_MARGIN, usual, angles)
             excess = self._excess(angles)
-            if excess.max() > MARGIN:
-                usual = angles + _TURN * np.rint((self._centre - angles) / _TURN)
-                angles = np.where(excess > MARGIN, usual, angles)
-                excess = self._excess(angles)
-            excess[..., 2] = 0.0
+        if previous is None:
+            cost = (np.abs(angles) + 100.0 * excess).sum(axis=-1)
+            beyond = np.zeros(cost.shape)
+        else:
+            outside = excess[..., 0] + excess[..., 1] + weight * excess[..., 2]
+            beyond = outside - outside[::-1]
             # continuity first; of two solutions as near the more usual one
-            cost = np.abs(angles - previous) + 0.1 * excess + 100.0 * np.maximum(excess - MARGIN, 0.0)
-        total = cost.sum(axis=-1)
-        best: BoolArray = total[0] <= total[1]
-        return np.where(best[:, None], angles[0], angles[1]), best
+            cost = (
+                np.abs(angles - previous).sum(axis=-1) + 0.1 * outside + 100.0 * np.maximum(beyond - self._margin, 0.0)
+            )
+        best: BoolArray = cost[0] <= cost[1]
+        return np.where(best[:, None], angles[0], angles[1]), best, np.where(best, beyond[0], beyond[1])
 
     def _excess(self, angles: FloatArray) -> FloatArray:
         excess: FloatArray = np.maximum(np.maximum(angles - self._high, self._low - angles), 0.0)

@@ -319,6 +319,25 @@ def _path(kind: str, offset: float) -> list[FloatArray]:
     return [arms(90.0 + t, offset, 30.0) for t in steps]  # forward
 
 
+def test_an_arm_that_passed_behind_its_t_pose_gets_its_usual_angles_back() -> None:
+    """Noise decides on which side of the singular pose an arm leaves it; the angles may not stay -75, 163, -150 deg."""
+    path = np.concatenate(
+        [np.linspace((0.0, 92.0, 0.0), (-75.0, 163.0, -150.0), 40), np.full((30, 3), (-75, 163, -150))]
+    )
+    before: JointAngles | None = None
+    found = []
+    for triple in path:
+        before = angles_of(estimate(arms(*triple), 3.0 * DEGREE), MODEL, "model", before)
+        columns = [before.names.index(f"shoulder_{each}_left") for each in ("flexion", "abduction", "rotation")]
+        found.append(np.degrees([before.position[columns], before.position_stddev[columns]]))
+    positions, stddevs = np.array(found).swapaxes(0, 1)
+    np.testing.assert_allclose(positions[-1], (105.0, 17.0, 30.0), atol=1.0)
+    assert stddevs[-1].max() < 30.0
+    jumps = np.flatnonzero(np.abs(np.diff(positions, axis=0)).max(axis=1) > 60.0)
+    assert len(jumps) == 1
+    assert stddevs[jumps[0], [0, 2]].min() > 60.0  # the deviations have said so before
+
+
 @pytest.mark.parametrize("name", CONVENTIONS)
 @pytest.mark.parametrize("kind", ["hanging", "t_pose", "up", "forward"])
 @pytest.mark.parametrize("offset", [0.0, 0.5, -2.0])
