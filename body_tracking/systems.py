@@ -95,6 +95,8 @@ def options_of(**given: Value) -> Options:
     if computed and not found["computed"]:
         others = given.get("sensors", ())
         found |= {"computed": computed, "sensors": (*(others if isinstance(others, tuple) else ()), *computed)}
+    if found["imus"] and not found["sensors"] and not found["filter"]:
+        found["filter"] = "ekf"  # the one that takes orientations without skeletons
     return found
 
 

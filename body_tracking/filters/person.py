@@ -113,7 +113,11 @@ class PersonFilter:
         self.by_sensor = role.input == graph.SENSORS_INPUT
         self.alignment: SensorAlignment | None = None
         self.people: People | None = None
-        if self.by_sensor:
+        if not settings.sensors and not self.by_sensor:
+            raise graph.GraphError(
+                f"filter {settings.filter_name} needs skeletons; inertial sensors alone need --filter ekf"
+            )
+        if self.by_sensor and settings.sensors:
             self.alignment = SensorAlignment(settings.sensors, settings.reference or None, settings.world)
             if one_of_several is None:
                 self.people = People(settings.sensors, settings.people, self.alignment.reference)

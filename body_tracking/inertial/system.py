@@ -25,7 +25,9 @@ from body_tracking.pipeline.system import (
 def _specs(options: Options) -> Iterable[NodeSpec]:
     if options["imus"]:
         given = {"segments": options["imus"], **sensors_and_transport(options), **asked(options, subject="subject")}
-        yield NodeSpec("imu_skeleton", "imu_skeleton", parameters=given)
+        # no skeleton will ever come, for which it would wait
+        alone: dict[str, Value] = {} if options["sensors"] else {"camera": False}
+        yield NodeSpec("imu_skeleton", "imu_skeleton", defaults=alone, parameters=given)
 
 
 def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:

@@ -99,7 +99,7 @@ class ReplaySettings:
     @property
     def other_sources(self) -> bool:
         """Whether the graph has sensors beside those of the option ``sensors``."""
-        return any(OPTIONS[name].source and bool(value) for name, value in self.more.items())
+        return bool(self.imus) or any(OPTIONS[name].source and bool(value) for name, value in self.more.items())
 
     def values(self) -> dict[str, dict[str, Value]]:
         """All parameters of each stage, by its name.
@@ -269,7 +269,7 @@ def _without(settings: ReplaySettings, bag: BagReader) -> bool:
     """
     if settings.sensors == (graph.NO_SENSORS,):
         if not settings.other_sources:
-            raise ReplayError(f"{bag.path}: sensors none, and no images or markers are asked for")
+            raise ReplayError(f"{bag.path}: sensors none, and no images, markers or inertial sensors are asked for")
         return True
     if settings.sensors or not settings.other_sources:
         return False
