@@ -64,6 +64,7 @@ class FilterSettings:
         lag: seconds by which frames are held back to be smoothed; 0 for none.
         kinect_arms: whether the skeletons are of a Kinect v2, whose arms err in their directions by a known law; the
             thesis's filters do not use it.
+        not_kinects: sensors to which this does not apply. With fused frames it then applies if there are others.
     """
 
     filter_name: str = DEFAULT_FILTER
@@ -78,6 +79,7 @@ class FilterSettings:
     people: PeopleParameters = field(default_factory=PeopleParameters)
     kinect_arms: bool = True
     lag: float = 0.0
+    not_kinects: Sequence[str] = ()
 
 
 class PersonFilter:
@@ -121,7 +123,9 @@ class PersonFilter:
             self.alignment = SensorAlignment(settings.sensors, settings.reference or None, settings.world)
             if one_of_several is None:
                 self.people = People(settings.sensors, settings.people, self.alignment.reference)
-        self._corrects_arms = settings.kinect_arms and settings.filter_name not in THESIS_FILTERS
+        corrects = settings.kinect_arms and settings.filter_name not in THESIS_FILTERS
+        self._kinects = set(settings.sensors) - set(settings.not_kinects) if corrects else set()
+        self._corrects_fused = corrects and (bool(self._kinects) or not settings.sensors)
         self._ordering = Ordering(settings.sensors, settings.order_wait)
         self._model_filter = self._filter if isinstance(self._filter, ModelFilter) else None
         self.models = self._model_filter is not None
@@ -202,7 +206,7 @@ class PersonFilter:
             now_ns: time of arrival, in a steady clock.
         """
         self.poll(now_ns)
-        skeleton = self._corrected(skeletons[0])
+        skeleton = corrected_arms(skeletons[0]) if self._corrects_fused else skeletons[0]
         self._present = True
         if self._model_filter is not None:
             self._take([("", skeleton)], now_ns)
@@ -235,11 +239,7 @@ class PersonFilter:
         else:
             return None
         aligned = None if self.alignment is None else self.alignment.push(sensor, subject)
-        return None if aligned is None else self._corrected(aligned)
-
-    def _corrected(self, skeleton: Skeleton) -> Skeleton:
-        """With the arms in their anatomical directions."""
-        return corrected_arms(skeleton) if self._corrects_arms else skeleton
+        return corrected_arms(aligned) if aligned is not None and sensor in self._kinects else aligned
 
     def on_orientation(self, measurement: SegmentOrientation, now_ns: int) -> None:
         """Take the orientation of one segment, in ``world`` and in the reference's clock.

@@ -86,6 +86,12 @@ KINECT_ARMS = Parameter(
     "effect on the thesis's filters",
     live=True,
 )
+NOT_KINECTS = Parameter(
+    "not_kinects",
+    (),
+    "sensors to which kinect_arms does not apply; up and replay name those of --depth and --camera here",
+    live=True,
+)
 ORIENTATIONS = Parameter(
     "orientations",
     (),
@@ -148,6 +154,7 @@ class FilterStage(Stage):
         LAG,
         ORIENTATIONS,
         KINECT_ARMS,
+        NOT_KINECTS,
         *PEOPLE,
         *filter_table(),
         RELIABLE,
@@ -178,6 +185,7 @@ class FilterStage(Stage):
             people_from(values),
             given["kinect_arms"],
             given["lag"],
+            names_in(values["not_kinects"]),
         )
         return filter_of(settings, self._publish, self.wanted)
 

@@ -36,8 +36,8 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
     # those of the arms are in the mesh of a depth camera already, and would count twice
     segments = tuple(each.segment for each in worn if not (options["depth"] and each.segment in graph.ARM_SEGMENTS))
     defaults: dict[str, Value] = {"orientations": segments} if segments else {}
-    if options["sensors"] and options["sensors"] == options["computed"]:
-        defaults["kinect_arms"] = False  # joints of a fitted mesh, and no Kinect's
+    if options["computed"]:
+        defaults["not_kinects"] = options["computed"]
     if options["lag"] and options["filter"] in THESIS_FILTERS:
         raise graph.GraphError(f"filter {options['filter']} cannot smooth (lag)")
     chosen = asked(options, filter="filter", input="filter_input", subject="subject", people="people", lag="lag")

@@ -183,8 +183,8 @@ def test_a_depth_camera_is_a_sensor_of_the_graph_that_its_mesh_tracker_computes(
     assert "mesh_tracker" in alone and not any("_skeleton" in name for name in alone)
     assert alone["fusion"].parameters["sensors"] == ("kinect1_mesh",)
     both = {spec.name: spec for spec in nodes_for(options_of(depth=("kinect1",), sensors=("kinect2",)))}
-    assert alone["skeleton_filter"].defaults["kinect_arms"] is False
-    assert "kinect_arms" not in both["skeleton_filter"].defaults
+    for specs in (alone, both):
+        assert specs["skeleton_filter"].defaults["not_kinects"] == ("kinect1_mesh",)
     assert both["fusion"].parameters["sensors"] == ("kinect2", "kinect1_mesh") and "kinect2_skeleton" in both
     options = options_of(depth=("kinect1",), bag="bag")
     assert played(options, {INFO, IMAGES}) == (INFO, IMAGES)
