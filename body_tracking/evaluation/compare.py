@@ -71,7 +71,7 @@ def compare_pair(one: Side, other: Side) -> Pair:
     if isinstance(one, MarkerReference):
         raise EvaluationError(f"{one.source} and {other.source}: both are of the marker system")
     if isinstance(other, MarkerReference):
-        judged = evaluate_by_markers(one, other)
+        judged = evaluate_by_markers(one, other, one_clock=True)
         rows, notes = judged.angles, judged.notes
         count = np.array([row.samples for row in rows], dtype=np.float64)
         if not count.sum():

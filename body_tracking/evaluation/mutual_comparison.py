@@ -20,7 +20,7 @@ from body_tracking.evaluation.hand_eye import MAX_GAP
 from body_tracking.evaluation.metrics import wrapped
 from body_tracking.evaluation.reading import AngleSeries, EvaluationError
 from body_tracking.evaluation.reference_error import Differences, Judged, judge
-from body_tracking.evaluation.start_clock import start_clock
+from body_tracking.evaluation.start_clock import STAMPS_AS_THEY_ARE, start_clock
 
 USABLE: Final = float(np.radians(30.0))
 """Radians: an angle with a larger deviation counts as unknown. A robot that follows angles stops far below it."""
@@ -145,11 +145,7 @@ def _clock(estimate: EstimatedSegments, reference: EstimatedSegments, both: str)
     except (EvaluationError, ValueError) as error:
         if not -estimate.seconds[-1] < apart < reference.seconds[-1]:
             raise EvaluationError(f"{both}: their stamps do not overlap, and {error}") from error
-        return (
-            0.0,
-            float("nan"),
-            ["the movement does not determine the clocks' offset; the stamps are taken as they are"],
-        )
+        return 0.0, float("nan"), [STAMPS_AS_THEY_ARE]
     middle_ns = round(0.5 * float(estimate.seconds[-1]) * NANOSECONDS)
     return clock.offset_ns_at(middle_ns) / NANOSECONDS - apart, clock.stddev, []
 

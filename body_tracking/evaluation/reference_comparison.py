@@ -26,7 +26,7 @@ from body_tracking.evaluation.marker_reference import MarkerReference
 from body_tracking.evaluation.metrics import angle_errors, wrapped
 from body_tracking.evaluation.reading import EvaluationError
 from body_tracking.evaluation.reference_error import Differences, Judged, judge
-from body_tracking.evaluation.start_clock import start_clock
+from body_tracking.evaluation.start_clock import STAMPS_AS_THEY_ARE, start_clock
 from body_tracking.kinematics.conventions import Chain
 from body_tracking.kinematics.upper_body import PARENTS, UpperBody
 
@@ -81,7 +81,11 @@ class ReferenceEvaluation:
 
 
 def evaluate_by_markers(
-    estimate: EstimatedSegments, reference: MarkerReference, known_mountings: Mapping[str, Mounting] | None = None
+    estimate: EstimatedSegments,
+    reference: MarkerReference,
+    known_mountings: Mapping[str, Mounting] | None = None,
+    *,
+    one_clock: bool = False,
 ) -> ReferenceEvaluation:
     """Judge an estimate by the marker system.
 
@@ -89,6 +93,7 @@ def evaluate_by_markers(
         estimate: of one person.
         reference: targets on the same person.
         known_mountings: of some targets, from another recording of the same targets on the same person.
+        one_clock: where the motion does not determine the offset of the clocks, take the stamps as they are.
 
     Raises:
         EvaluationError: the angular speeds determine no clock, too little overlap, or a motion that determines neither
@@ -100,7 +105,7 @@ def evaluate_by_markers(
     columns = [SEGMENT_NUMBER[reference.segments[target]] for target in targets]
     times, rotations = estimate.seconds, estimate.rotations[:, columns]
     where = f"{estimate.source} and {reference.source}"
-    clock, notes = _start_clock(estimate, reference, rotations, targets)
+    clock, notes = _start_clock(estimate, reference, rotations, targets, one_clock)
     begin, end = (each + clock.offset for each in (times[0], times[-1]))
     begin, end = max(begin, min(t.times[0] for t in tracks)), min(end, max(t.times[-1] for t in tracks))
     if end - begin < LEAST_OVERLAP:
@@ -168,14 +173,23 @@ def _notes(judged: Sequence[Judged | None]) -> list[str]:
 
 
 def _start_clock(
-    estimate: EstimatedSegments, reference: MarkerReference, rotations: FloatArray, targets: Sequence[str]
+    estimate: EstimatedSegments,
+    reference: MarkerReference,
+    rotations: FloatArray,
+    targets: Sequence[str],
+    one_clock: bool,
 ) -> tuple[ClockModel, list[str]]:
     """The targets' clock against the estimate's, both from their first stamps, by the angular speeds; and notes."""
     own = {target: estimate.track(rotations[:, number]) for number, target in enumerate(targets)}
     apart = (int(estimate.stamps_ns[0]) - reference.first_ns) / NANOSECONDS
     length, other = float(estimate.seconds[-1]), max(float(track.times[-1]) for track in reference.tracks.values())
     sources = f"{estimate.source} ({length:.1f} s) and {reference.source} ({other:.1f} s)"
-    return start_clock(own, reference.tracks, apart, sources, reference.segments)
+    try:
+        return start_clock(own, reference.tracks, apart, sources, reference.segments)
+    except EvaluationError:
+        if not one_clock:
+            raise
+        return ClockModel(round(apart * NANOSECONDS)), [STAMPS_AS_THEY_ARE]
 
 
 # --- differences

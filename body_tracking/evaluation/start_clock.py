@@ -13,6 +13,8 @@ from body_tracking.evaluation.hand_eye import Track
 from body_tracking.evaluation.reading import EvaluationError
 from body_tracking.inertial.clock import clock_offset, turning
 
+STAMPS_AS_THEY_ARE: Final = "the motion does not determine the offset of the clocks; the stamps are taken as they are"
+"""A note."""
 _SAME_CLOCK: Final = 1.0
 """Seconds: half width of the search where the stamps are taken to be of one clock."""
 _AGREE: Final = 0.1

@@ -168,7 +168,7 @@ def _coarse(reference: Series, other: Series, guess: float, window: float) -> fl
     for peak in rivals[np.argsort(rho[rivals])[: -_RIVALS - 1 : -1]].tolist():
         of_peak, time_peak = _unexplained(found, peak)
         samples = min(found.overlap[best], found.overlap[peak]) / max(time_best, time_peak)
-        if 0.5 * samples * np.log(of_peak / of_best) < DECISIVE:  # eq. 3
+        if 0.5 * samples * np.log(of_peak / max(of_best, 1e-12)) < DECISIVE:  # eq. 3
             return None
     return guess + float(found.lags[best])
 

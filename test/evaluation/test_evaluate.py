@@ -97,7 +97,7 @@ def test_fused_skeletons_are_judged_where_asked_or_where_there_are_no_others(
     [
         (["{empty}"], r"empty: /filtered/skeleton is empty"),
         (["{one}"], r"one: 1 skeleton\(s\) .* at least 2"),
-        (["{wave}", "--truth", "{two}"], r"two: no topic /ground_truth/skeleton \(skeletons there: /filtered"),
+        (["{wave}", "--truth", "{two}"], r"two: none of the 2 skeletons of /filtered/skeleton has a trunk"),
         (["{wave}", "--truth", "{twist}", "--own-clock"], r"do not show the same movement: best correlation"),
         (
             ["{two}", "--truth", "{twist}"],
