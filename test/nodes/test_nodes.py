@@ -278,13 +278,18 @@ def test_a_recording_plays_as_it_was_recorded(tmp_path: Path) -> None:
             zero_ns = reader.start_ns
             raws = reader.messages([graph.skeleton_topic("kinect2")])
             captured = np.array([(decode_skeletons(raw.cdr) or ())[0].stamp_ns - zero_ns for raw in raws])
-        running.until(lambda: len(received) == len(frames))
+        assert running.until(lambda: running.said("kinect_skeleton").get("") == "ended")
+        said = running.said("kinect_skeleton")
+        left_out = int(said.get("left out, late", 0))  # on a busy machine
+        running.until(lambda: len(received) == len(frames) - left_out)
+        assert len(received) == len(frames) - left_out > 0.5 * len(frames)
         # when the message plays, less its delay then
         stamps = np.array([to_nanoseconds(cloud.header.stamp) - round(start * NANOSECONDS) for cloud in received])
-        np.testing.assert_allclose(stamps, captured / 20.0, rtol=0.0, atol=1e3)
+        places = np.abs(captured[None] / 20.0 - stamps[:, None]).argmin(axis=1)
+        np.testing.assert_allclose(stamps, captured[places] / 20.0, rtol=0.0, atol=1e3)
+        assert (np.diff(places) > 0).all()
         last = cloud_to_skeletons(received[-1])[0]
-        assert np.array_equal(last.positions, frames[-1].positions, equal_nan=True)
-        assert running.until(lambda: running.said("kinect_skeleton").get("") == "ended")
+        assert np.array_equal(last.positions, frames[places[-1]].positions, equal_nan=True)
         assert stop(running.processes["kinect_skeleton"]) == 0
 
 
