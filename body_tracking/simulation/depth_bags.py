@@ -6,7 +6,7 @@ inertial sensor on each forearm, and the truth: joints, angles, the camera's pos
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -95,7 +95,7 @@ def write_depth_bag(scene: DepthScene, folder: Path, seconds: float, *, overwrit
         bag.write(info_topic(SENSOR), info, RECEIVED_FROM_NS)
         pose = pose_to_transform(scene.pose, WORLD, BAG_MESSAGES)
         bag.write(graph.TRUE_CALIBRATION, serialize(pose), RECEIVED_FROM_NS)
-        messages, progress = [*_inertial(scene, seconds)], Progress(0, round(seconds * RATE))
+        messages, progress = [*inertial_messages(scene, seconds)], Progress(0, round(seconds * RATE))
         joints = []
         for index, frame in enumerate(scene.frames(0.0, seconds)):
             stamp_ns = START_NS + round(frame.time * NANOSECONDS)
@@ -129,16 +129,18 @@ def _skeletons(scene: DepthScene, joints: FloatArray) -> Iterator[_Message]:
             yield log_ns, graph.skeleton_topic(SENSOR), encode_skeletons([skeleton])
 
 
-def _inertial(scene: DepthScene, seconds: float) -> Iterator[_Message]:
-    """The readings of the wrist-worn sensors, oriented by their own fusion."""
-    for number, segment in enumerate(_FOREARMS):
+def inertial_messages(
+    scene: DepthScene, seconds: float, segments: Sequence[str] = _FOREARMS, rate: float = 100.0
+) -> Iterator[tuple[int, str, bytes]]:
+    """Log time, topic and content of the readings of worn sensors, oriented by their own fusion, in no order."""
+    for number, segment in enumerate(segments):
         place = MODEL.segment_names.index(segment)
 
         def motion(times: FloatArray, place: int = place) -> tuple[FloatArray, FloatArray]:
             posture = MODEL.forward(scene.course(times).q, scene.who.person.lengths)
             return posture.rotations[:, place], posture.origins[:, place]
 
-        imu = SimulatedImu(segment, segment, usual_mounting(segment, scene.who.person.stature), oriented=True)
+        imu = SimulatedImu(segment, segment, usual_mounting(segment, scene.who.person.stature), rate, oriented=True)
         rng = np.random.default_rng([scene.seed, 4, number])
         samples = imu.samples(
             motion, seconds, START_NS, rng, surroundings=Surroundings(), received_from_ns=RECEIVED_FROM_NS

@@ -21,7 +21,7 @@ from body_tracking.markers.joint_model import SIZE, Joint, JointKind, axis_frame
 from body_tracking.markers.observations import TargetPose
 from body_tracking.markers.rig import Rig
 from body_tracking.markers.targets import Target
-from body_tracking.simulation.people import MODEL, Person
+from body_tracking.simulation.people import MODEL, Course, Person
 from body_tracking.simulation.repertoire import make_movement
 
 FOCAL, WIDTH, HEIGHT = 834.0, 640, 480
@@ -162,13 +162,22 @@ def marker_scene(
     """
     rng = np.random.default_rng([seed, 20110215])
     person = Person.draw(rng)
-    # the same in all motions of a person, so that joints fitted to one serve for the others
-    worn = so3.quat_to_matrix(so3.exp(np.random.default_rng([seed, 98]).normal(0.0, 0.3, (len(SEGMENTS), 3))))
     movement = make_movement(motion, person, rng, None)
     count = round(rate * min(seconds, movement.duration))
     start = max(0.0, 0.5 * (movement.duration - count / rate)) if start is None else start
-    times = start + np.arange(count) / rate
-    course = movement.course(times)
+    return scene_of(person, movement.course(start + np.arange(count) / rate), seed)
+
+
+def scene_of(person: Person, course: Course, seed: int) -> MarkerScene:
+    """A person who moves before the rig, the left arm in the middle of its view.
+
+    Args:
+        person: the body.
+        course: its motion in the person's own frame, which the rig faces.
+        seed: of how the targets are worn.
+    """
+    # the same in all motions of a person, so that joints fitted to one serve for the others
+    worn = so3.quat_to_matrix(so3.exp(np.random.default_rng([seed, 98]).normal(0.0, 0.3, (len(SEGMENTS), 3))))
     posture = MODEL.forward(course.q, person.lengths)
     indices = [MODEL.segment_names.index(segment) for segment in SEGMENTS.values()]
     # x right, y down, z forward in the rig; the person's arm in the middle of its view, facing the rig
@@ -185,7 +194,7 @@ def marker_scene(
     angles = MODEL.difference(MODEL.neutral(), course.q)[:, [upper, lower]]
     centres = (posture.origins[0, indices] - away) @ to_rig.T + np.array([middle, 0.0, _AWAY])
     chain = _true_chain(rotations[0], translations[0], centres, worn)
-    return MarkerScene(rig, make_targets(), times, rotations, translations, angles, chain)
+    return MarkerScene(rig, make_targets(), course.times, rotations, translations, angles, chain)
 
 
 def _true_chain(rotations: FloatArray, translations: FloatArray, origins: FloatArray, worn: FloatArray) -> Chain:

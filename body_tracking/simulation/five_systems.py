@@ -1,0 +1,217 @@
+"""The shipped recording of one simulated person before sensors of all five systems at once, with the truth.
+
+Two Kinects report skeletons; the first one's depth images go to the mesh, a colour-and-depth camera at its place has
+colour and depth images of its own; six inertial sensors are worn; and two infrared cameras see targets on the left
+shoulder, upper arm and forearm (their balls are recorded in place of the images, which are ten times as large).
+``config/five_systems`` has the setup of the infrared cameras, and ``config/five_systems.yaml`` the arguments of
+``replay`` for each system, which ``body_tracking compare`` takes.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from body_tracking.camera.codecs import CompressedColour
+from body_tracking.camera.topics import COMPRESSED, DRIVERS
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.estimate import ModelEstimate
+from body_tracking.core.message_types import COMPRESSED_IMAGE, IMAGE, IMU, JOINT_STATE, POINT_CLOUD, TRANSFORM
+from body_tracking.core.qos import LATCHED, RELIABLE, SENSOR_DATA, Qos
+from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, Skeleton, TrackingState
+from body_tracking.kinect.simulated_sensor import Misreading, SimulatedKinect
+from body_tracking.kinematics.positional import positional_angles
+from body_tracking.markers import setup
+from body_tracking.markers.boards import Chessboard
+from body_tracking.markers.camera_calibration import calibrate_cameras, find_boards
+from body_tracking.markers.chain_files import save_chain
+from body_tracking.markers.codecs import Balls
+from body_tracking.markers.detection import detect
+from body_tracking.markers.rig_storage import save_rig
+from body_tracking.markers.targets_file import save_targets
+from body_tracking.mesh.codecs import DepthImage, DepthInfo
+from body_tracking.mesh.topics import IMAGES, depth_topic, info_topic
+from body_tracking.messages.angles import angles_to_joint_state
+from body_tracking.messages.calibration import pose_to_transform
+from body_tracking.messages.cameras import CAMERA_INFO
+from body_tracking.messages.cdr import encode_skeletons
+from body_tracking.messages.model import estimate_to_joint_state
+from body_tracking.pipeline import graph
+from body_tracking.recording.marker_commands import fit_recording
+from body_tracking.recording.progress import Progress
+from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, BagWriter, serialize
+from body_tracking.simulation import marker_bags
+from body_tracking.simulation.camera_bags import pose_around
+from body_tracking.simulation.colour_images import CAMERA, Painter, colour_camera
+from body_tracking.simulation.depth_bags import inertial_messages
+from body_tracking.simulation.depth_scene import RATE, SENSOR, DepthScene, held_out, kinect_camera
+from body_tracking.simulation.makehuman import MakeHuman
+from body_tracking.simulation.marker_scene import DIAMETER, JOINTS, MarkerScene, scene_of
+from body_tracking.simulation.people import MODEL
+from body_tracking.simulation.repertoire import make_movement
+from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS, WORLD, draw_clock
+
+SHIPPED: Final = "five_systems"
+SECONDS: Final = 14.0
+MOTION: Final = "reaching"
+SECOND: Final = "kinect2"
+WORN: Final = ("pelvis", "upper_trunk", "upper_arm_left", "upper_arm_right", "forearm_left", "forearm_right")
+"""Segments with an inertial sensor."""
+_SEED: Final = 7
+_AROUND: Final = 0.8
+"""Radians about the person at which the second Kinect stands."""
+_EVERY: Final = 2
+"""Every second image of 30 a second."""
+_WIDTH: Final = 480
+_IMU_RATE: Final = 60.0
+_DELAY_NS: Final = 30_000_000
+"""From the capture of an image to its receipt."""
+_BALLS_DELAY_NS: Final = 15_000_000
+_CHUNK_BYTES: Final = 32 << 20
+_FIT_RATE, _FIT_SECONDS = 15.0, 14.0
+
+_Message = tuple[int, str, bytes]
+"""Log time, topic, serialised message."""
+
+
+def make_shipped(bags: Path, config: Path, people: MakeHuman) -> None:
+    """Write the recording and the setup of its infrared cameras, replacing what is there.
+
+    Raises:
+        BagError: the recording cannot be written.
+    """
+    who = held_out(people, _SEED)
+    scene = DepthScene(who, MOTION, _SEED, kinect_camera(2), still=True)
+    colour = DepthScene(who, MOTION, _SEED, colour_camera(_WIDTH // 2), still=True)
+    times = np.arange(round(SECONDS * RATE)) / RATE
+    markers = scene_of(who.person, scene.movement.course(times), _SEED)
+    _make_setup(scene, config / SHIPPED)
+    messages = [
+        *_depth_and_truth(scene),
+        *_colour(colour),
+        *_kinects(scene),
+        *inertial_messages(scene, SECONDS, WORN, _IMU_RATE),
+        *_balls(markers),
+    ]
+    names = DRIVERS["plain"].of(CAMERA)
+    topics: dict[str, tuple[str, Qos]] = {
+        depth_topic(SENSOR): (IMAGE, IMAGES),
+        info_topic(SENSOR): (CAMERA_INFO, LATCHED),
+        names.colour + COMPRESSED: (COMPRESSED_IMAGE, IMAGES),
+        names.colour_info: (CAMERA_INFO, LATCHED),
+        names.depth: (IMAGE, IMAGES),
+        names.depth_info: (CAMERA_INFO, LATCHED),
+        **{graph.skeleton_topic(sensor): (POINT_CLOUD, SENSOR_DATA) for sensor in (SENSOR, SECOND)},
+        **{f"/{segment}/imu/data": (IMU, SENSOR_DATA) for segment in WORN},
+        **{setup.balls_topic(camera.frame_id): (POINT_CLOUD, SENSOR_DATA) for camera in markers.rig.cameras},
+        graph.TRUE_SKELETON: (POINT_CLOUD, SENSOR_DATA),
+        graph.TRUE_MODEL_STATE: (JOINT_STATE, SENSOR_DATA),
+        graph.TRUE_ANGLES: (JOINT_STATE, RELIABLE),
+        graph.TRUE_CALIBRATION: (TRANSFORM, LATCHED),
+    }
+    folder = bags / SHIPPED
+    with BagWriter(folder, overwrite=True, chunk_bytes=_CHUNK_BYTES, flush_interval_s=float("inf")) as bag:
+        for topic, (type_name, qos) in topics.items():
+            bag.add_topic(topic, type_name, qos)
+        for log_ns, topic, cdr in sorted(messages, key=lambda item: item[:2]):
+            bag.write(topic, cdr, log_ns)
+    size = sum(path.stat().st_size for path in folder.iterdir())
+    print(f"{folder}: {SECONDS:.0f} s of five systems, {size / 1e6:.2f} MB")
+
+
+def _make_setup(scene: DepthScene, folder: Path) -> None:
+    """Calibrate the infrared cameras from rendered boards, and fit the joints to another motion of the same person."""
+    folder.mkdir(parents=True, exist_ok=True)
+    person = scene.who.person
+    movement = make_movement("random", person, np.random.default_rng([_SEED, 20110215]), None)
+    learnt = scene_of(person, movement.course(np.arange(round(_FIT_RATE * _FIT_SECONDS)) / _FIT_RATE), _SEED)
+    series = list(zip(*marker_bags.board_images(learnt.rig, 16, _SEED, marker_bags.DARK), strict=True))
+    frames = [camera.frame_id for camera in learnt.rig.cameras]
+    sizes = [(camera.width, camera.height) for camera in learnt.rig.cameras]
+    board = Chessboard(marker_bags.COLUMNS, marker_bags.ROWS, marker_bags.SQUARE)
+    save_rig(calibrate_cameras(frames, sizes, find_boards(board, series)).rig, folder / setup.RIG)
+    save_targets([replace(each, name=f"{each.name}_left") for each in learnt.targets], folder / setup.TARGETS)
+    # by the names of the segments, so that `evaluate` and `compare` know where each target is worn
+    joints = [replace(each, parent=f"{each.parent}_left", child=f"{each.child}_left") for each in JOINTS]
+    with tempfile.TemporaryDirectory() as temporary:
+        motion = Path(temporary) / "motion"
+        marker_bags.write_scene(learnt, motion, marker_bags.DARK, _SEED + 1)
+        save_chain(fit_recording(motion, folder, joints, DIAMETER).chain, folder / setup.CHAIN)
+
+
+def _stamp(seconds: float, delay_ns: int = _DELAY_NS) -> tuple[int, int]:
+    """Stamp by the reference clock, and when it was received."""
+    elapsed_ns = round(seconds * NANOSECONDS)
+    return START_NS + elapsed_ns, RECEIVED_FROM_NS + elapsed_ns + delay_ns
+
+
+def _depth_and_truth(scene: DepthScene) -> Iterator[_Message]:
+    info = DepthInfo().encode((START_NS, scene.camera), BAG_WIRE)
+    yield RECEIVED_FROM_NS, info_topic(SENSOR), info
+    yield RECEIVED_FROM_NS, graph.TRUE_CALIBRATION, serialize(pose_to_transform(scene.pose, WORLD, BAG_MESSAGES))
+    progress = Progress(0, round(SECONDS * RATE))
+    for index, frame in enumerate(scene.frames(0.0, SECONDS)):
+        stamp_ns, log_ns = _stamp(frame.time)
+        if index % _EVERY == 0:
+            image = DepthImage().encode((stamp_ns, scene.camera.frame_id, frame.image), BAG_WIRE)
+            yield log_ns, depth_topic(SENSOR), image
+        tracked = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
+        truth = Skeleton(stamp_ns, WORLD, scene.pose.apply(frame.joints), tracked)
+        yield log_ns, graph.TRUE_SKELETON, encode_skeletons([truth])
+        angles = angles_to_joint_state(positional_angles(truth), graph.DEFAULT_BODY, WORLD, BAG_MESSAGES)
+        yield log_ns, graph.TRUE_ANGLES, serialize(angles)
+        q, lengths = scene.course(np.array([frame.time])).q[0], scene.who.person.lengths
+        exact, unknown = np.zeros((2 * MODEL.nv, 2 * MODEL.nv)), np.full(MODEL.nv, np.nan)
+        state = ModelEstimate(stamp_ns, WORLD, 0, q, unknown, exact, lengths, np.zeros_like(lengths))
+        yield log_ns, graph.TRUE_MODEL_STATE, serialize(estimate_to_joint_state(state, MODEL, BAG_MESSAGES))
+        progress.at(index)
+    progress.end()
+
+
+def _colour(scene: DepthScene) -> Iterator[_Message]:
+    painter, names = Painter.of(scene, colour_camera(_WIDTH)), DRIVERS["plain"].of(CAMERA)
+    for topic, camera in ((names.colour_info, painter.camera), (names.depth_info, scene.camera)):
+        yield RECEIVED_FROM_NS, topic, DepthInfo().encode((START_NS, camera), BAG_WIRE)
+    progress = Progress(0, round(SECONDS * RATE) // _EVERY)
+    for index, frame in enumerate(scene.frames(0.0, SECONDS, _EVERY)):
+        stamp_ns, log_ns = _stamp(frame.time)
+        taken = (stamp_ns, painter.camera.frame_id, painter.image(frame))
+        yield log_ns, names.colour + COMPRESSED, CompressedColour().encode(taken, BAG_WIRE)
+        depth = (stamp_ns, scene.camera.frame_id, frame.image)
+        yield log_ns, names.depth, DepthImage().encode(depth, BAG_WIRE)
+        progress.at(index)
+    progress.end()
+
+
+def _kinects(scene: DepthScene) -> Iterator[_Message]:
+    """What two Kinects report, each with a clock of its own, whose errors at the person are alike."""
+    misreading = Misreading.draw(np.random.default_rng([_SEED, 6]))
+    for number, pose in enumerate((scene.pose, pose_around(SECOND, _AROUND))):
+        rng = np.random.default_rng([_SEED, 3, number])
+        clock = draw_clock(rng) if number else ClockModel(anchor_ns=START_NS)
+        kinect = SimulatedKinect(pose, clock, float(rng.uniform(0.0, 1.0 / RATE)) if number else 0.0)
+        yield RECEIVED_FROM_NS, graph.TRUE_CALIBRATION, serialize(pose_to_transform(pose, WORLD, BAG_MESSAGES))
+        times = kinect.capture_times(SECONDS, rng)
+        course = scene.course(times)
+        joints = np.array([scene.who.posed(course, index)[1] for index in range(len(times))])
+        seen = kinect.see(times, joints, scene.who.person.capsules(), rng, misreading)
+        for frame in kinect.deliver(times, {0: seen}, START_NS, RECEIVED_FROM_NS, rng):
+            yield frame.received_ns, graph.skeleton_topic(pose.sensor), encode_skeletons(frame.skeletons)
+
+
+def _balls(scene: MarkerScene) -> Iterator[_Message]:
+    """The balls that the detector finds in rendered infrared images."""
+    progress = Progress(0, len(scene.times))
+    for index, time in enumerate(scene.times.tolist()):
+        stamp_ns, log_ns = _stamp(time, _BALLS_DELAY_NS)
+        images = marker_bags.images(scene, index, marker_bags.DARK, _SEED)
+        for camera, image in zip(scene.rig.cameras, images, strict=True):
+            found = detect(image, stamp_ns, camera.frame_id)
+            yield log_ns, setup.balls_topic(camera.frame_id), Balls().encode(found, BAG_WIRE)
+        progress.at(index)
+    progress.end()
