@@ -5,8 +5,6 @@ the tangent space (an error-state filter, Sola 2017), because base and shoulders
 ExtendedKalmanFilter has a plain vector as state, and inverts the matrices that are factored here.
 
 - Motion: each velocity is an Ornstein-Uhlenbeck process with time constant ``velocity_time``, driven by white noise.
-  The density of each joint's noise adapts: it grows where the corrections of the velocities are correlated or larger
-  than their covariance.
 - Measurement noise: a sensor's white noise is estimated from the third differences of each point over time, in which
   smooth motion nearly cancels; no tuning per sensor. Systematic errors that persist for seconds (a joint offset from
   the anatomical one) are a state that is considered but not estimated (Schmidt 1966), with the deviation of

@@ -92,13 +92,12 @@ class ExtendedKalmanFilter:
         self._motion = Motion(space, p)
         self._sensors = SensorErrors(space, p)
         self._priors = Priors(space, p, self.counters)
-        self._poses = PoseSearch(space, self._motion, self._sensors, p, self.counters)
+        self._poses = PoseSearch(space, self._sensors, p, self.counters)
         self._centres = JointCentres(self.counters)
         self._displacement = Displacement(space, self._centres, p)
         self._orientations = OrientationUpdate(space, self._motion, self._priors, self._displacement, p, self.counters)
         self._skeletons = SkeletonUpdate(
             space,
-            self._motion,
             self._sensors,
             self._poses,
             self._priors,

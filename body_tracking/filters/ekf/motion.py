@@ -1,4 +1,4 @@
-"""Motion model of a person, with adaptive noise densities."""
+"""Motion model of a person."""
 
 from __future__ import annotations
 
@@ -7,47 +7,49 @@ import math
 import numpy as np
 
 from body_tracking.core import so3
-from body_tracking.core.skeleton import NANOSECONDS, FloatArray, IntArray
+from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray
 from body_tracking.filters.ekf.kernels import carry, transported
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.sources import PER_SOURCE, advance
 from body_tracking.filters.ekf.state import State, StateSpace
 
-_WHITENESS_TIME = 0.25
-"""Seconds over which corrections of a velocity are summed: about what the filter takes to follow a movement."""
+_SIDES, _ARM = ("left", "right"), ("shoulder", "elbow", "forearm", "wrist")
 _OF_SPEED = 16.0
 """1/s: with orientations, additional density of a joint's acceleration per square of its speed. A limb swung twice a
 second has 4 pi times its speed as acceleration for about a tenth of a second; with too small a density the lag would be
 attributed to errors of the sources."""
 _DOUBT_TIME = 0.65
 """Seconds for which frames that contradict the state are remembered: one errs as those shortly before."""
-_UNTOUCHED = 0.02
-_RATIO_BOUND = 8.0
-_DENSITY_DOWN, _DENSITY_UP = 3.0, 4.0
+_DENSITY = {
+    "base_level": 1.0,
+    "base_height": 1.0,
+    "base_turn": 20.0,
+    "base_tilt": 2.0,
+    "spine": 2.0,
+    "arm": 3.0,
+}
+"""Spectral densities of accelerations, chosen on simulated people: m2/s3 of the base's place, rad2/s3 of the rest. People
+walk and turn at once, and hardly rise or tilt; neck and clavicles move as the spine does, arm is shoulder to wrist."""
+_BESIDE_ORIENTATIONS = 50.0
+"""rad2/s3: least density of the joints that turn a segment whose orientation is measured. Orientations are quick and need
+no smoothing; what a pose is too slow to follow would be taken for errors of their sources."""
 
 
 class Motion:
-    """Integrated Ornstein-Uhlenbeck velocities, and the densities of the noise that drives them.
+    """Integrated Ornstein-Uhlenbeck velocities.
 
     Args:
         space: of the states.
         parameters: of the filter.
-
-    Attributes:
-        first_log_density: (groups,) log of the spectral densities before anything is learnt.
     """
 
     def __init__(self, space: StateSpace, parameters: EkfParameters) -> None:
         self._space, self._model, self._parameters = space, space.model, parameters
         self._balls = np.ascontiguousarray(space.model.ball_v[:, 0])
-        self._group, self.first_log_density = self._groups()
-        self._log_density_bounds = self.first_log_density - _DENSITY_DOWN, self.first_log_density + _DENSITY_UP
-        self._group_sum = np.zeros((len(self.first_log_density), space.nv))
-        self._group_sum[self._group, np.arange(space.nv)] = 1.0
+        self._same_joint, self._density = self._densities()
         self._quick = self._quick_table()
-        self._swift = np.zeros((len(self._quick), space.nv), dtype=np.bool_)
-        for segment, turning in enumerate(self._quick):
-            self._swift[segment, turning[turning >= 6]] = True
+        self._swift = self._quick.copy()
+        self._swift[:, :6] = False
 
     def predicted(self, state: State, stamp_ns: int) -> State:
         """The motion model over the time that passed (integrated Ornstein-Uhlenbeck velocity)."""
@@ -57,9 +59,12 @@ class Motion:
             return state
         tau = self._parameters.velocity_time
         fade, reach = self._faded(dt)
-        density = np.exp(state.log_density)[self._group]
+        density = self._density
         if state.sources.names:
-            speeds = (self._group_sum @ (state.velocity * state.velocity))[self._group]
+            speeds = self._same_joint @ (state.velocity * state.velocity)
+            density = density.copy()
+            quick = self._quick[state.sources.segments].any(axis=0)
+            density[quick] = np.maximum(density[quick], _BESIDE_ORIENTATIONS)
             density += _OF_SPEED * self._swift[state.sources.segments].any(axis=0) * speeds
         step = reach * state.velocity
         q = self._model.integrate(state.q, step)
@@ -83,14 +88,11 @@ class Motion:
             share = advance(p, space.size, sources, dt, self._parameters)
             crosses.reshape(len(p), -1)[space.size :].reshape(len(sources), PER_SOURCE, -1)[:, 4:] *= share
             sources = sources.faded(share)
-        fading = math.exp(-dt / _WHITENESS_TIME)
         return state.but(
             stamp_ns=stamp_ns,
             q=q,
             velocity=fade * state.velocity,
             covariance=p,
-            moved=fading * state.moved,
-            moved_variance=fading * fading * state.moved_variance,
             crosses=crosses,
             since_prior=state.since_prior + dt,
             tracked=state.tracked + dt,
@@ -119,56 +121,25 @@ class Motion:
         p = self._parameters
         return p.slow_time_beside_orientations if state.sources.names else p.slow_time
 
-    def densities_learnt(
-        self, state: State, moved: FloatArray, variance: FloatArray, remaining: FloatArray, dt: float
-    ) -> FloatArray:
-        """Adapt the spectral densities to the mean corrections of the velocities."""
-        rate = self._parameters.density_rate * dt / _WHITENESS_TIME
-        # coordinates that the measurement does not touch say nothing
-        share = variance / (variance + _UNTOUCHED * remaining + 1e-30)
-        ratio = np.minimum(moved * moved / (variance + 1e-30), _RATIO_BOUND) - 1.0
-        lean = self._group_sum @ (share * ratio) / (self._group_sum @ share + 0.3)
-        least, greatest = self._log_density_bounds
-        if state.sources.names:
-            least = least.copy()
-            quick = np.concatenate([self._quick[segment] for segment in state.sources.segments.tolist()])
-            least[self._group[quick]] = math.log(self._parameters.density_beside_orientations)
-            greatest = np.maximum(greatest, least)
-        result: FloatArray = np.minimum(np.maximum(state.log_density + rate * lean, least), greatest)
-        return result
-
-    def _groups(self) -> tuple[IntArray, FloatArray]:
-        """(32,) the group of each coordinate that shares a density, and (groups,) their first log densities."""
-        p = self._parameters
-        keys: list[str] = []
+    def _densities(self) -> tuple[FloatArray, FloatArray]:
+        """(32, 32) which coordinates are of the same joint, and (32,) the density of each."""
+        joints: list[str] = []
         densities: list[float] = []
-        groups = np.empty(self._space.nv, dtype=np.intp)
-        for number, name in enumerate(self._model.coordinate_names):
-            part = name.split("_")[0]
-            side = name.rsplit("_", 1)[-1]
-            if part == "base":
-                # people walk and turn, and hardly rise or tilt
-                kinds = {"x": "base_level", "y": "base_level", "z": "base_height", "rz": "base_turn"}
-                key = kinds.get(side, "base_tilt")
-            elif side in ("left", "right"):
-                key = f"{part}_{side}"
-            else:
-                key = part
-            if key not in keys:
-                keys.append(key)
-                limb, hand = key.startswith(("shoulder", "elbow")), key.startswith(("forearm", "wrist"))
-                density = p.density_limb if limb else p.density_hand if hand else p.density_trunk
-                base = {"base_level": p.density_translation, "base_height": p.density_translation}
-                densities.append({**base, "base_turn": p.density_turn}.get(key, density))
-            groups[number] = keys.index(key)
-        return groups, np.log(densities)
+        for name in self._model.coordinate_names:
+            part, side = name.split("_")[0], name.rsplit("_", 1)[-1]
+            kinds = {"x": "base_level", "y": "base_level", "z": "base_height", "rz": "base_turn"}
+            joint = kinds.get(side, "base_tilt") if part == "base" else f"{part}_{side}" if side in _SIDES else part
+            joints.append(joint)
+            densities.append(_DENSITY.get(joint, _DENSITY["arm" if joint.startswith(_ARM) else "spine"]))
+        same = np.array([[float(one == other) for other in joints] for one in joints])
+        return same, np.array(densities)
 
-    def _quick_table(self) -> list[IntArray]:
-        """(12,) of each segment the coordinates that turn it quickly: those of its limb, of the trunk all."""
-        found = []
-        for segment in self._model.segment_names:
-            side = segment.rsplit("_", 1)[-1]
-            turning = self._model.turned_by(segment)
-            own = [k for k in turning.tolist() if self._model.coordinate_names[k].endswith(f"_{side}")]
-            found.append(np.array(own or turning, dtype=np.intp))
+    def _quick_table(self) -> BoolArray:
+        """(12, 32) of each segment the coordinates that turn it quickly: those of its limb, of the trunk all."""
+        names = self._model.coordinate_names
+        found = np.zeros((len(self._model.segment_names), len(names)), dtype=np.bool_)
+        for number, segment in enumerate(self._model.segment_names):
+            turning = self._model.turned_by(segment).tolist()
+            own = [k for k in turning if names[k].endswith("_" + segment.rsplit("_", 1)[-1])]
+            found[number, own or turning] = True
         return found

@@ -67,7 +67,6 @@ class OrientationUpdate:
         since = math.inf if number is None else (measurement.stamp_ns - int(sources.stamps[number])) / NANOSECONDS
         if since < _AHEAD_OF / p.orientation_rate:
             return state
-        before_ns = state.oriented_ns or measurement.stamp_ns
         if measurement.stamp_ns - state.stamp_ns > _TOGETHER_NS:
             state = self._motion.predicted(state, measurement.stamp_ns)
         segment = SEGMENT_NUMBER[measurement.segment]
@@ -111,16 +110,7 @@ class OrientationUpdate:
             corrected, _ = self._turned_by(state, measurement, number, own)
         if near:
             corrected = self._spun_by(corrected, measurement, number, own)
-            before, after = (m.covariance.diagonal()[space.velocities] for m in (state, corrected))
-            moved = state.moved + (corrected.velocity - state.velocity)
-            moved_variance = state.moved_variance + np.maximum(before - after, 0.0)
-            dt = (measurement.stamp_ns - before_ns) / NANOSECONDS
-            state = corrected.but(
-                log_density=self._motion.densities_learnt(state, moved, moved_variance, after, dt),
-                moved=moved,
-                moved_variance=moved_variance,
-                oriented_ns=measurement.stamp_ns,
-            )
+            state = corrected.but(oriented_ns=measurement.stamp_ns)
         self._counters["orientations_used" if near else "orientations_rejected"] += 1
         looked_at = state.sources.looked_at(number, measurement, p, unfit_for, lean, leaning)
         return self._priors.within(self._priors.bounded(state.but(sources=looked_at)))

@@ -21,33 +21,6 @@ class EkfParameters(OrientationParameters):
     velocity_time: float = number_field(
         0.8, "time constant of the decay of velocities without measurements", "s", 0.05, 100.0
     )
-    density_translation: float = number_field(
-        1.0, "spectral density of the base's acceleration per axis, before it is learnt", "m2/s3", 1e-5, 1e3
-    )
-    density_trunk: float = number_field(
-        2.0,
-        "spectral density of the angular acceleration of the base's tilt, spine, neck, clavicles, at first",
-        "rad2/s3",
-        1e-4,
-        1e4,
-    )
-    density_turn: float = number_field(
-        20.0,
-        "spectral density of the angular acceleration with which the whole person turns, at first: people stand, and "
-        "then turn at once",
-        "rad2/s3",
-        1e-4,
-        1e4,
-    )
-    density_limb: float = number_field(
-        3.0, "spectral density of the angular acceleration of shoulders and elbows, at first", "rad2/s3", 1e-4, 1e4
-    )
-    density_hand: float = number_field(
-        3.0, "spectral density of the angular acceleration of forearms and wrists, at first", "rad2/s3", 1e-4, 1e4
-    )
-    density_rate: float = number_field(
-        0.1, "how quickly the densities follow the movement; 0 leaves them", "1", 0.0, 10.0
-    )
     white_stddev: float = number_field(
         0.01, "standard deviation of a sensor's white noise before it is learnt", "m", 0.0005, 0.5
     )

@@ -9,7 +9,6 @@ from body_tracking.core.body_model import ModelError
 from body_tracking.core.skeleton import BONES, NANOSECONDS, BoolArray, FloatArray, Joint
 from body_tracking.filters.ekf.algebra import CLOSE
 from body_tracking.filters.ekf.kernels import LEAN_FRAMES, MISFIT
-from body_tracking.filters.ekf.motion import Motion
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.sensor_errors import SensorErrors
 from body_tracking.filters.ekf.sources import PER_SOURCE
@@ -43,7 +42,6 @@ class PoseSearch:
 
     Args:
         space: of the states.
-        motion: of the filter.
         sensors: of the filter.
         parameters: of the filter.
         counters: of the filter.
@@ -56,12 +54,11 @@ class PoseSearch:
     def __init__(
         self,
         space: StateSpace,
-        motion: Motion,
         sensors: SensorErrors,
         parameters: EkfParameters,
         counters: dict[str, int],
     ) -> None:
-        self._space, self._model, self._motion, self._sensors = space, space.model, motion, sensors
+        self._space, self._model, self._sensors = space, space.model, sensors
         self._parameters, self._counters, self._gate = parameters, counters, parameters.gate
         self.inverse = CompiledInverse(space.model, space.ranges, space.prior_table)
         self.started_by: tuple[str, int] | None = None
@@ -129,16 +126,12 @@ class PoseSearch:
         covariance[n, t] = covariance[t, n].T
         covariance[n, n] = lengths_covariance
         covariance[v, v] = np.diag(self._velocity_variance)
-        zero = np.zeros(space.nv)
         return State(
             stamp_ns,
             q,
             lengths,
-            zero,
+            np.zeros(space.nv),
             covariance,
-            self._motion.first_log_density if previous is None else previous.log_density,
-            zero,
-            zero,
             {} if previous is None else previous.sensors,
             (),
             np.empty((size, 0), dtype=np.float32),

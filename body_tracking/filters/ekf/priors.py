@@ -108,7 +108,6 @@ class Priors:
             q=q,
             velocity=state.velocity * signs,
             covariance=state.covariance * both * both[:, None],
-            moved=state.moved * signs,
             crosses=state.crosses * single(both)[:, None],
         )
 

@@ -11,7 +11,6 @@ from body_tracking.core import so3
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, IntArray, TrackingState
 from body_tracking.filters.ekf.algebra import CLOSE, FAR, LINEARISATIONS
 from body_tracking.filters.ekf.kernels import crosses_updated, expected, gated, solved
-from body_tracking.filters.ekf.motion import Motion
 from body_tracking.filters.ekf.orientations import OrientationUpdate
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.poses import PoseSearch
@@ -65,7 +64,6 @@ class SkeletonUpdate:
 
     Args:
         space: of the states.
-        motion: of the filter.
         sensors: of the filter.
         poses: of the filter.
         priors: of the filter.
@@ -81,7 +79,6 @@ class SkeletonUpdate:
     def __init__(
         self,
         space: StateSpace,
-        motion: Motion,
         sensors: SensorErrors,
         poses: PoseSearch,
         priors: Priors,
@@ -89,7 +86,7 @@ class SkeletonUpdate:
         parameters: EkfParameters,
         counters: dict[str, int],
     ) -> None:
-        self._space, self._model, self._motion, self._sensors = space, space.model, motion, sensors
+        self._space, self._model, self._sensors = space, space.model, sensors
         self._poses, self._priors, self._orientations = poses, priors, orientations
         self._parameters, self._counters, self._gate = parameters, counters, parameters.gate
         self.forget()
@@ -212,10 +209,6 @@ class SkeletonUpdate:
         )
         for ball, turn in turns:
             crosses[ball] = turn @ crosses[ball]
-        moved = state.moved + correction[space.velocities]
-        before, after = (m.diagonal()[space.velocities] for m in (state.covariance, covariance))
-        moved_variance = state.moved_variance + np.maximum(before - after, 0.0)
-
         foreseeable = float(predicted_variance.max()) < _FORESEEABLE**2
         slow_scale, slow_estimate, information = (
             self._sensors.slow_learnt(sensor, measurement, whitening, white, rows, bool(state.sources.names))
@@ -235,9 +228,6 @@ class SkeletonUpdate:
             lengths=state.lengths + correction[space.lengths],
             velocity=state.velocity + correction[space.velocities],
             covariance=covariance,
-            log_density=self._motion.densities_learnt(state, moved, moved_variance, after, dt),
-            moved=moved,
-            moved_variance=moved_variance,
             sensors={**state.sensors, measurement.sensor: learnt},
             crosses=crosses,
             sources=state.sources if len(correction) == space.size else state.sources.moved(correction[space.size :]),

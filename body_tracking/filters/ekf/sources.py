@@ -136,15 +136,6 @@ class OrientationParameters:
         0.05,
         1000.0,
     )
-    density_beside_orientations: float = number_field(
-        50.0,
-        "orientations: spectral density of the angular acceleration, at least, of the joints that turn a segment whose "
-        "orientation is measured: orientations are quick and need no smoothing, and what a pose is too slow to follow "
-        "would be taken for errors of their sources",
-        "rad2/s3",
-        1e-4,
-        1e4,
-    )
     start_after: float = number_field(
         1.0, "orientations: without a skeleton for so long the body is started by orientations alone", "s", 0.0, 60.0
     )

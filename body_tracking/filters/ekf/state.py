@@ -91,9 +91,6 @@ class State(Changeable):
         stamp_ns: of the state.
         q, lengths, velocity: the estimate.
         covariance: (85, 85) of the tangent, the lengths and the velocities; m more of m / 7 sources of orientations.
-        log_density: (groups,) log of the spectral density of each group of coordinates.
-        moved: (32,) faded sum of the corrections of the velocities.
-        moved_variance: (32,) its variance in a consistent filter.
         sensors: estimated errors of each.
         slow_names: (n,) sensors whose slow errors are correlated with the state.
         crosses: (85 + m, 61 n) covariance of the state with the slow errors of these, in units of their deviation. In
@@ -124,9 +121,6 @@ class State(Changeable):
     lengths: FloatArray
     velocity: FloatArray
     covariance: FloatArray
-    log_density: FloatArray
-    moved: FloatArray
-    moved_variance: FloatArray
     sensors: dict[str, SensorState]
     slow_names: tuple[str, ...]
     crosses: SingleArray
