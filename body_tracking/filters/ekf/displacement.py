@@ -61,7 +61,7 @@ class Displacement:
         """The same, where (53, 53) information is what is known without any point."""
         space = self._space
         weights = sum(
-            (1.0 / (sensor.white + sensor.slow[0] * space.base_variance) for sensor in state.sensors.values()),
+            (1.0 / (sensor.white + sensor.slow * space.base_variance) for sensor in state.sensors.values()),
             np.zeros(space.points),
         )
         offsets = self._parameters.offset_scale * np.sqrt(space.base_variance)

@@ -530,7 +530,7 @@ class ExtendedKalmanFilter:
         for each in self._waiting:
             known = sensors.get(each.sensor) or self._sensors.unknown(each, len(by_sensor) == len(self._waiting))
             known = self._sensors.seen_by(known, each, each.measured)
-            slow = np.maximum(known.slow, self._sensors.least_slow(known.white, each))
+            slow = max(known.slow, self._sensors.least_slow(known.white, each))
             sensors[each.sensor] = known.but(slow=slow)
         # only the noise is kept: the frames themselves are still to come
         learnt = {name: sensor.but(stamps=(), positions=sensor.positions[:0]) for name, sensor in sensors.items()}

@@ -28,11 +28,11 @@ _DENSITY = {
     "spine": 2.0,
     "arm": 3.0,
 }
-"""Spectral densities of accelerations, chosen on simulated people: m2/s3 of the base's place, rad2/s3 of the rest. People
-walk and turn at once, and hardly rise or tilt; neck and clavicles move as the spine does, arm is shoulder to wrist."""
+"""Spectral densities of accelerations, chosen on simulated people: m2/s3 of the base's place, rad2/s3 of the rest.
+People walk and turn at once, and hardly rise or tilt; neck and clavicles move as the spine, arm is shoulder to wrist."""
 _BESIDE_ORIENTATIONS = 50.0
-"""rad2/s3: least density of the joints that turn a segment whose orientation is measured. Orientations are quick and need
-no smoothing; what a pose is too slow to follow would be taken for errors of their sources."""
+"""rad2/s3: least density of the joints that turn a segment whose orientation is measured. Orientations are quick and
+need no smoothing; what a pose is too slow to follow would be taken for errors of their sources."""
 
 
 class Motion:

@@ -15,8 +15,8 @@ _DIMENSIONS = 3
 _MEAN = np.full(_DIMENSIONS, 1.0 / _DIMENSIONS)
 _FLOOR = 1e-3
 """Metres: no sensor's white noise is taken for less."""
-_MAX_SLOW = np.array([9.0, 1.0])
-"""Greatest scales of the slow variance: of points three times the model's deviation, of limbs as it is stated."""
+_MAX_SLOW = 9.0
+"""Greatest scale of the slow variance: three times the model's deviation."""
 _THIRD_DIFFERENCE_SPAN = 0.25
 """Seconds beyond which four frames in a row show motion, not noise."""
 _CORRELATED = 2.31
@@ -27,11 +27,9 @@ _POOL = 8.0
 """Frames from which on a point's own noise counts alone."""
 _OUTLYING = 6.0
 """A squared difference counts as at most so many times the variance."""
-STRETCH = 0.1
-"""Share of the length of an upper arm or forearm that a sensor, at unit scale of its slow errors, is wrong by."""
-_LEAST_STRETCH = 0.067
-"""The same, of a sensor that states covariances, at least, where no orientations are measured: a Kinect v2's upper arms
-and forearms vary by 6.7 % (root mean square over clips of UI-PRMD)."""
+STRETCH = 0.067
+"""Share of the length of an upper arm or forearm that a sensor that states covariances is wrong by: a Kinect v2's vary
+by 6.7 % (root mean square over clips of UI-PRMD)."""
 _ALONE = 0.1
 """Share of the parameter ``slow_scale`` for a sensor that no other one contradicts: with all of it the population's
 segment lengths outweigh the person's in the first seconds, and elbows err by 10 instead of 6 degrees
@@ -64,8 +62,7 @@ class SensorErrors:
     def __init__(self, space: StateSpace, parameters: EkfParameters) -> None:
         self._space, self._model, self._parameters = space, space.model, parameters
         self._limbs = tuple(f"{part}_{side}" for part in ("upper_arm", "forearm") for side in ("left", "right"))
-        self._limb_points = self._limb_table()
-        self.carried = self._limb_points[2]
+        self.carried = self._limb_table()
         self.slow_size = 3 * space.points + len(self._limbs)
 
     def unknown(self, measurement: Measurement, alone: bool = False) -> SensorState:
@@ -79,7 +76,7 @@ class SensorErrors:
         p = self._parameters
         stated = measurement.skeleton.covariances is not None
         points = _ALONE * p.slow_scale if alone else p.slow_scale
-        slow = np.array([points, (_LEAST_STRETCH / STRETCH) ** 2]) if stated else np.zeros(2)
+        slow = points if stated else 0.0
         white = np.full(space.points, p.white_stddev**2)
         return SensorState(
             (),
@@ -89,7 +86,7 @@ class SensorErrors:
             np.zeros(space.points),
             slow,
             slow,
-            np.full(2, 4.0),
+            4.0,
             stated,
         )
 
@@ -135,66 +132,50 @@ class SensorErrors:
         white: FloatArray,
         rows: IntArray,
         oriented: bool,
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """One step of maximum likelihood (Fisher scoring) for the scales of the slow variance.
+    ) -> tuple[float, float, float]:
+        """One step of maximum likelihood (Fisher scoring) for the scale of the slow variance of points.
 
         Returns:
-            (2,) the scales to be used, (2,) their estimates and (2,) the information of these.
+            The scale to be used, its estimate and the information of this.
         """
         least = self.least_slow(sensor.white, measurement)
         if oriented and measurement.skeleton.covariances is not None:
-            least = np.array([max(least[0], self._parameters.slow_beside_orientations), 0.0])
+            least = max(least, self._parameters.slow_beside_orientations)
         # It changes slowly, and takes a while to compute.
         soon = sensor.stamps and measurement.stamp_ns // _SLOW_PERIOD_NS == sensor.stamps[-1] // _SLOW_PERIOD_NS
         # What is white is not known at first, and would be taken for slow.
         if soon or sensor.weight.max() < 2.0 * _POOL:
-            scales = _kept(sensor.slow, np.maximum(sensor.slow, least))
-            return scales, sensor.slow_estimate, sensor.slow_information
-        starts, ends, carried = self._limb_points
-        along = STRETCH * (measurement.positions[ends] - measurement.positions[starts])
-        limbs = (carried[:, None, :] * along.T).reshape(-1, len(self._limbs))
-        points = len(rows)
-        half = np.concatenate(
-            [whitening * np.sqrt(measurement.model_variance).repeat(3)[rows], whitening @ limbs[rows]], axis=1
-        )
-        likely = white @ half
+            return _kept(sensor.slow, max(sensor.slow, least)), sensor.slow_estimate, sensor.slow_information
+        half = whitening * np.sqrt(measurement.model_variance).repeat(3)[rows]
         gram = half.T @ half
         expected = gram.diagonal()
-        squares = likely**2
+        squares = (white @ half) ** 2
         # one that is far from all others says nothing, where all are far they say much
-        shares = np.sort(squares[:points] / np.maximum(expected[:points], 1e-30))
-        usual = max(1.0, float(shares[points // 2]) / _MEDIAN_OF_CHI2)
-        score = 0.5 * (np.minimum(squares, _SLOW_BOUND * usual * expected) - expected)
-        squared = gram * gram
-        scores = np.array([score[:points].sum(), score[points:].sum()])
-        information = 0.5 * np.array([squared[:points, :points].sum(), squared[points:, points:].sum()])
+        shares = np.sort(squares / np.maximum(expected, 1e-30))
+        usual = max(1.0, float(shares[len(rows) // 2]) / _MEDIAN_OF_CHI2)
+        score = 0.5 * float((np.minimum(squares, _SLOW_BOUND * usual * expected) - expected).sum())
+        information = 0.5 * float((gram * gram).sum())
         passed = _SLOW_PERIOD_NS / NANOSECONDS
-        total = sensor.slow_information * np.exp(-passed / _SLOW_MEMORY) + information
+        total = sensor.slow_information * math.exp(-passed / _SLOW_MEMORY) + information
         # the mean of what each frame says, which may be less than nothing
-        estimate = sensor.slow_estimate + (information * (sensor.slow - sensor.slow_estimate) + scores) / total
+        estimate = sensor.slow_estimate + (information * (sensor.slow - sensor.slow_estimate) + score) / total
         # an error is taken for real when it stands out: else every sensor would have a little of it
-        real = estimate * np.sqrt(total) > _SIGNIFICANT
-        scales = np.maximum(np.where(real, np.minimum(estimate, _MAX_SLOW), 0.0), least)
-        return _kept(sensor.slow, scales), estimate, total
+        real = estimate * math.sqrt(total) > _SIGNIFICANT
+        return _kept(sensor.slow, max(min(estimate, _MAX_SLOW) if real else 0.0, least)), estimate, total
 
-    def least_slow(self, white: FloatArray, measurement: Measurement) -> FloatArray:
-        """(2,) lower bounds of the systematic error's scale: total expected error minus the measured white noise."""
+    def least_slow(self, white: FloatArray, measurement: Measurement) -> float:
+        """Lower bound of the systematic error's scale: total expected error minus the measured white noise."""
         missing = self._space.points * _LEAST_ERROR**2 - float(white.sum())
-        stretch = 0.0 if measurement.skeleton.covariances is None else (_LEAST_STRETCH / STRETCH) ** 2
-        return np.array([max(missing, 0.0) / float(measurement.model_variance.sum()), stretch])
+        return max(missing, 0.0) / float(measurement.model_variance.sum())
 
-    def per_error(self, scales: FloatArray) -> FloatArray:
-        """(61,) what belongs to each slow error, from (2,) what belongs to those of points and of limbs."""
-        return np.repeat(scales, (3 * self._space.points, len(self._limbs)))
-
-    def slow_stddev(self, scales: FloatArray, measurement: Measurement) -> tuple[FloatArray, FloatArray]:
+    def slow_stddev(self, sensor: SensorState, measurement: Measurement) -> tuple[FloatArray, FloatArray]:
         """(19,) metres, of the slow errors of points by themselves; (4,) of those of limbs, as a share of their length.
 
         The upper arms and forearms are too long or too short in some poses, with all that hangs on them: along a limb a
         depth sensor finds its joints by a tenth of the length nearer or farther.
         """
-        points, limbs = np.sqrt(scales)
-        return points * np.sqrt(measurement.model_variance), np.full(len(self._limbs), limbs * STRETCH)
+        stretch = STRETCH if sensor.stated else 0.0
+        return math.sqrt(sensor.slow) * np.sqrt(measurement.model_variance), np.full(len(self._limbs), stretch)
 
     def place_of(self, state: State, sensor: str) -> int:
         """First column of a sensor's slow errors in ``State.crosses``."""
@@ -203,29 +184,23 @@ class SensorErrors:
     def point_stddev(self, measurement: Measurement, sensors: Mapping[str, SensorState]) -> FloatArray:
         """(19,) metres; infinity where not measured."""
         sensor = sensors.get(measurement.sensor) or self.unknown(measurement)
-        return np.where(
-            measurement.measured, np.sqrt(sensor.white + sensor.slow[0] * measurement.model_variance), np.inf
-        )
+        return np.where(measurement.measured, np.sqrt(sensor.white + sensor.slow * measurement.model_variance), np.inf)
 
-    def _limb_table(self) -> tuple[IntArray, IntArray, FloatArray]:
-        """(4,) points at the start and (4,) at the end of each limb, and (19, 4) which points it carries."""
+    def _limb_table(self) -> FloatArray:
+        """(19, 4) which points each limb carries."""
         point = {Joint(joint): number for number, joint in enumerate(self._model.joints)}
-        starts, ends = [], []
         beyond = np.zeros((self._space.points, len(self._limbs)))
         chain = ("SHOULDER", "ELBOW", "WRIST", "HAND", "HAND_TIP", "THUMB")
         for column, limb in enumerate(self._limbs):
             first = 0 if limb.startswith("upper_arm") else 1
             parts = [point[Joint[f"{name}_{limb.rsplit('_', 1)[1].upper()}"]] for name in chain]
-            starts.append(parts[first])
-            ends.append(parts[first + 1])
             beyond[parts[first + 1 :], column] = 1.0
-        return np.array(starts, dtype=np.intp), np.array(ends, dtype=np.intp), beyond
+        return beyond
 
 
-def _kept(before: FloatArray, after: FloatArray) -> FloatArray:
-    """(2,) the new scales of slow errors, or the very same as before where they hardly differ."""
-    pairs = zip(before.tolist(), after.tolist(), strict=True)
-    return before if all(abs(b - a) <= _SLOW_STEP * a for a, b in pairs) else after
+def _kept(before: float, after: float) -> float:
+    """The new scale of slow errors, or the one before where they hardly differ."""
+    return before if abs(before - after) <= _SLOW_STEP * after else after
 
 
 def _typical(variances: FloatArray, weight: float) -> float:

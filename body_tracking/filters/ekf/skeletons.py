@@ -30,7 +30,6 @@ _AWAY_NS = NANOSECONDS // 4
 """Unseen for longer than this, a limb may have turned farther than a linearisation reaches."""
 _YOUNG = 1.0
 """Seconds from the start on in which a pose may be far from where a frame is linearised."""
-_TINY = 1e-30
 _ENOUGH_BLOCKS = 5
 """Seconds of frames from which on the lengths are what these say."""
 _LENGTHS_PERIOD = 0.75
@@ -204,7 +203,7 @@ class SkeletonUpdate:
             seen.observation,
             rows,
             place,
-            self._sensors.slow_stddev(sensor.slow, measurement)[0],
+            self._sensors.slow_stddev(sensor, measurement)[0],
             seen.limbs,
         )
         for ball, turn in turns:
@@ -215,13 +214,12 @@ class SkeletonUpdate:
             if foreseeable  # elsewhere the linearisation errs by more than the sensor
             else (sensor.slow, sensor.slow_estimate, sensor.slow_information)
         )
-        if slow_scale is not sensor.slow:
+        if slow_scale != sensor.slow and sensor.slow > 0.0:
             # What the slow errors did to the state so far is as much smaller as they are.
-            ratio = np.where(sensor.slow > 0.0, slow_scale / np.maximum(sensor.slow, _TINY), 1.0)
-            ratio = self._sensors.per_error(ratio)
-            own_cross = crosses[:, place : place + self._sensors.slow_size]
-            covariance -= (own_cross * (1.0 - ratio)) @ own_cross.T
-            own_cross *= np.sqrt(ratio)
+            ratio = slow_scale / sensor.slow
+            own_cross = crosses[:, place : place + 3 * space.points]
+            covariance -= (1.0 - ratio) * own_cross @ own_cross.T
+            own_cross *= np.float32(math.sqrt(ratio))
         learnt = learnt.but(slow=slow_scale, slow_estimate=slow_estimate, slow_information=information)
         return state.but(
             q=self._model.integrate(state.q, correction[space.tangent]),
@@ -258,7 +256,7 @@ class SkeletonUpdate:
         turns = np.zeros((0, 3, 3))
         if correction is not None:  # in the tangent of the state
             turns = so3.right_jacobian(correction[self._model.ball_v])
-        own, along = self._sensors.slow_stddev(sensor.slow, measurement)
+        own, along = self._sensors.slow_stddev(sensor, measurement)
         found = _Expected(
             *expected(
                 q,
@@ -298,8 +296,8 @@ class SkeletonUpdate:
             measurement.measured & (measurement.skeleton.states[self._model.joints] == _TRACKED),
             sensor.white,
             measurement.model_variance,
-            float(sensor.slow[0]),
-            math.sqrt(sensor.slow[1]) * STRETCH,
+            sensor.slow,
+            STRETCH if sensor.stated else 0.0,
         )
         news = seen.blocks is not state.seen.blocks and len(seen.blocks) >= _ENOUGH_BLOCKS
         state = state.but(seen=seen)

@@ -66,9 +66,9 @@ class SensorState(Changeable):
         white: (19,) variance of the white noise per axis, square metres.
         differences: (19,) mean of the squared differences of each point alone.
         weight: (19,) how many of these there were.
-        slow: (2,) scales of the slow variance: of points by themselves, of limbs.
-        slow_estimate: (2,) their running estimates, of which only significant ones are used.
-        slow_information: (2,) of the estimates.
+        slow: scale of the slow variance of points.
+        slow_estimate: its running estimate, of which only a significant one is used.
+        slow_information: of the estimate.
         stated: whether its skeletons bring covariances, which include the systematic error.
     """
 
@@ -77,9 +77,9 @@ class SensorState(Changeable):
     white: FloatArray
     differences: FloatArray
     weight: FloatArray
-    slow: FloatArray
-    slow_estimate: FloatArray
-    slow_information: FloatArray
+    slow: float
+    slow_estimate: float
+    slow_information: float
     stated: bool
 
 
