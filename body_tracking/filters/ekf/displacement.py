@@ -7,17 +7,13 @@ from scipy.linalg import block_diag
 
 from body_tracking.calibration.joint_centres import JointCentres
 from body_tracking.core.measurement import joint_correlation
-from body_tracking.core.skeleton import N_JOINTS, FloatArray, Joint
+from body_tracking.core.skeleton import N_JOINTS, FloatArray
 from body_tracking.filters.ekf.kernels import displaced
 from body_tracking.filters.ekf.parameters import EkfParameters
-from body_tracking.filters.ekf.sources import PER_SOURCE
 from body_tracking.filters.ekf.state import State, StateSpace
 from body_tracking.kinematics.compiled_body import Linearised
 
 _DIMENSIONS = 3
-_BENT, _ARM_OFFSETS = ("SHOULDER", "ELBOW", "WRIST"), 2.0
-"""Joints that show which way an arm is bent, and how many times the usual distance their centres are off for that: a
-Kinect v2 sees hanging arms bent to where they are not (13 cm at the wrist, simulated as calibrated with recordings)."""
 
 
 class Displacement:
@@ -27,21 +23,15 @@ class Displacement:
         space: of the states.
         centres: what is known of the joints' centres.
         parameters: of the filter.
-
-    Attributes:
-        prior_information: (53, 53) on tangent and lengths without any measurement.
     """
 
     def __init__(self, space: StateSpace, centres: JointCentres, parameters: EkfParameters) -> None:
         self._space, self._centres, self._parameters = space, centres, parameters
-        self._of_arms = np.isin(
-            space.model.joints, [Joint[f"{name}_{side}"] for name in _BENT for side in ("LEFT", "RIGHT")]
-        )
         self._rows = (_DIMENSIONS * space.model.joints[:, None] + np.arange(_DIMENSIONS)).reshape(-1)
         joints = space.model.joints
         correlation = joint_correlation()[np.ix_(joints, joints)]
         self._correlation = np.kron(correlation, np.eye(_DIMENSIONS))
-        self.prior_information = block_diag(np.diag(space.rest_information), np.linalg.inv(space.lengths_covariance))
+        self._prior_information = block_diag(np.diag(space.rest_information), np.linalg.inv(space.lengths_covariance))
 
     def displaced(self, state: State) -> FloatArray:
         """(53, 53) covariance of tangent and lengths by offsets of the joint centres.
@@ -51,15 +41,8 @@ class Displacement:
         without any measurement: ``G B G^T``. To first order: forearms and hands, which are hardly longer than the
         offsets, err by more.
         """
-        lines = self._space.model.linearised(state.q, state.lengths)
-        information = self.prior_information
-        if state.sources.names:
-            information = information + self._held(state, lines)
-        return self.covariance(state, lines, information)
-
-    def covariance(self, state: State, lines: Linearised, information: FloatArray) -> FloatArray:
-        """The same, where (53, 53) information is what is known without any point."""
         space = self._space
+        lines = space.model.linearised(state.q, state.lengths)
         weights = sum(
             (1.0 / (sensor.white + sensor.slow * space.base_variance) for sensor in state.sensors.values()),
             np.zeros(space.points),
@@ -67,14 +50,12 @@ class Displacement:
         offsets = self._parameters.offset_scale * np.sqrt(space.base_variance)
         if state.sources.names:
             weights = np.where(space.thumbs[state.sources.segments].any(axis=0), 0.0, weights)
-            offsets = np.where(self._of_arms, _ARM_OFFSETS * offsets, offsets)
-        observation = lines.observation
         if self._centres.offsets is not None:
             spread = self._parameters.offset_scale**2 * self._left(state, lines)
         else:
             deviations = offsets.repeat(_DIMENSIONS)
             spread = self._correlation * deviations * deviations[:, None]
-        return displaced(observation, weights, information, spread)
+        return displaced(lines.observation, weights, self._prior_information, spread)
 
     def _left(self, state: State, lines: Linearised) -> FloatArray:
         """(57, 57) covariance of the points' offsets after a T-pose."""
@@ -82,13 +63,3 @@ class Displacement:
         positions[self._space.model.joints] = lines.posture.positions
         spread: FloatArray = self._centres.spread(positions, state.stamp_ns)[np.ix_(self._rows, self._rows)]
         return spread
-
-    def _held(self, state: State, lines: Linearised) -> FloatArray:
-        """(53, 53) information on tangent and lengths by orientations, whatever cameras say."""
-        space = self._space
-        own = state.covariance.diagonal()[space.size :].reshape(-1, PER_SOURCE)
-        variance = own.sum(axis=1) / _DIMENSIONS  # of misalignment, heading and what persists together, per axis
-        turning = lines.rotation_jacobian[state.sources.segments]
-        information = np.zeros((space.observed, space.observed))
-        information[space.tangent, space.tangent] = np.einsum("nij,nik,n->jk", turning, turning, 1.0 / variance)
-        return information

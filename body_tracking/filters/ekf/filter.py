@@ -95,7 +95,7 @@ class ExtendedKalmanFilter:
         self._poses = PoseSearch(space, self._sensors, p, self.counters)
         self._centres = JointCentres(self.counters)
         self._displacement = Displacement(space, self._centres, p)
-        self._orientations = OrientationUpdate(space, self._motion, self._priors, self._displacement, p, self.counters)
+        self._orientations = OrientationUpdate(space, self._motion, self._priors, p, self.counters)
         self._skeletons = SkeletonUpdate(
             space,
             self._sensors,

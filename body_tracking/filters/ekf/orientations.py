@@ -11,7 +11,6 @@ from body_tracking.core import so3
 from body_tracking.core.orientation import SEGMENT_NUMBER, SegmentOrientation
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
 from body_tracking.filters.ekf.algebra import CLOSE, FAR, LINEARISATIONS, whitening_of
-from body_tracking.filters.ekf.displacement import Displacement
 from body_tracking.filters.ekf.motion import Motion
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.priors import Priors
@@ -36,7 +35,6 @@ class OrientationUpdate:
         space: of the states.
         motion: of the filter.
         priors: of the filter.
-        displacement: of the filter.
         parameters: of the filter.
         counters: of the filter.
     """
@@ -46,12 +44,11 @@ class OrientationUpdate:
         space: StateSpace,
         motion: Motion,
         priors: Priors,
-        displacement: Displacement,
         parameters: EkfParameters,
         counters: dict[str, int],
     ) -> None:
         self._space, self._model, self._ranges = space, space.model, space.ranges
-        self._motion, self._priors, self._displacement = motion, priors, displacement
+        self._motion, self._priors = motion, priors
         self._parameters, self._counters, self._gate = parameters, counters, parameters.gate
         self._by_thumbs = self._thumb_table()
 
@@ -238,13 +235,6 @@ class OrientationUpdate:
         # the updates by thumbs so far had too much weight
         doubtful = self._by_thumbs[sources.segments[-1]]
         covariance[doubtful, doubtful] += self._ranges.stddev[doubtful - 6] ** 2
-        # so was all, as if a camera took joints to be elsewhere at other times, which from now on it is not taken to
-        if not state.sources.names and any(sensor.stated for sensor in state.sensors.values()):
-            known = slice(0, self._space.observed)
-            lines = self._model.linearised(state.q, state.lengths)
-            covariance[known, known] += self._displacement.covariance(
-                state.but(sources=sources), lines, self._displacement.prior_information
-            )
         # what was unobserved may be so no longer
         null = np.empty((0, self._space.nv))
         return state.but(sources=sources, covariance=covariance, crosses=crosses, null=null)
