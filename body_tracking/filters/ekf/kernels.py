@@ -12,14 +12,8 @@ from body_tracking.filters.ekf.algebra import factored, forward_substituted, inv
 from body_tracking.kinematics.compiled_body import Tree, curved, integrated, linearised
 from body_tracking.kinematics.compiled_posture import PriorTable, prior_rows
 
-LEAN_TIME, LEAN_FRAMES = 0.3, 4.0
-"""Seconds over which innovations are averaged, and least number in a mean."""
-MISFIT = 0.02
-"""Metres: persistent distance of a person's points from any pose of the model."""
 _SUDDEN, _SUDDEN_TIME = 20.0, 0.05
 """m/s2 that a joint may be accelerated by beyond expectation (standard deviation), and the longest time for which."""
-_DRAWING, _MOST_GROWN = 3.0, 100.0
-"""Squared Mahalanobis distance that a point is taken for which has been rejected for long; greatest inflation."""
 _FIRST_LIMB = 6
 """Segment whose origin is the first shoulder; then the other, both elbows, both wrists."""
 _TANGENT, _VELOCITIES = 32, 53
@@ -145,7 +139,7 @@ def expected(
     white: FloatArray,
     turns: FloatArray,
     tree: Tree,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """A frame against its prediction.
 
     Args:
@@ -166,8 +160,8 @@ def expected(
 
     Returns:
         (57, 53) derivative of the points, (57,) innovation, (57, 57) its covariance, (n, 57) covariance of the state
-        with the innovation, (19, 3, 3) blocks of single points with what curvature adds, (19, 3, 3) the same without
-        limbs that are too long or too short, (57, 4) displacement by these.
+        with the innovation, (19, 3, 3) blocks of single points with what curvature adds, (57, 4) displacement by limbs
+        that are too long or too short.
     """
     points, _, axes, observation, _ = linearised(q, lengths, tree)
     count, known = len(points), observation.shape[1]
@@ -206,7 +200,7 @@ def expected(
                 half[row, k] += change
     product = np.dot(observation, half)
     s = np.dot(limbs, limbs.T)
-    blocks, unstretched = np.empty((count, 3, 3)), np.empty((count, 3, 3))
+    blocks = np.empty((count, 3, 3))
     for i in range(size):
         for j in range(size):
             s[i, j] += product[i, j] + product[j, i]
@@ -215,12 +209,8 @@ def expected(
         for i in range(3):
             for j in range(3):
                 # a normal error x makes x^2 / 2 of mean m and of variance 2 m^2
-                value = s[3 * point + i, 3 * point + j] + 2.0 * curvature[point, i] * curvature[point, j]
-                blocks[point, i, j] = value
-                for limb in range(limbs.shape[1]):
-                    value -= limbs[3 * point + i, limb] * limbs[3 * point + j, limb]
-                unstretched[point, i, j] = value
-    return observation, innovation, s, cross, blocks, unstretched, limbs
+                blocks[point, i, j] = s[3 * point + i, 3 * point + j] + 2.0 * curvature[point, i] * curvature[point, j]
+    return observation, innovation, s, cross, blocks, limbs
 
 
 @compiled
@@ -337,67 +327,29 @@ def pseudo_measured(
 
 @compiled
 def gated(
-    innovation: FloatArray,
-    blocks: FloatArray,
-    unstretched: FloatArray,
-    measured: BoolArray,
-    white: FloatArray,
-    rejected_for: FloatArray,
-    lean: FloatArray,
-    leaning: FloatArray,
-    dt: float,
-    gate: float,
-    reacquire_after: float,
-) -> tuple[BoolArray, FloatArray, FloatArray, FloatArray, FloatArray, float]:
-    """The gate of each point, and the mean of the innovations, which shows wrong poses that no single frame shows.
+    innovation: FloatArray, blocks: FloatArray, measured: BoolArray, rejected_for: FloatArray, dt: float, gate: float
+) -> tuple[BoolArray, FloatArray]:
+    """The gate of each point.
 
     Args:
         innovation: (57,) metres.
         blocks: (19, 3, 3) covariance of each point.
-        unstretched: (19, 3, 3) without limbs that are too long or too short: a wrong pose must not pass for these.
         measured: (19,) which points are.
-        white: (19,) variance of the white noise.
         rejected_for: (19,) seconds before this frame.
-        lean: (19, 3) as of the state, before it.
-        leaning: (19,) likewise.
         dt: seconds since the sensor's last frame.
         gate: greatest squared distance.
-        reacquire_after: seconds.
 
     Returns:
-        (19,) which points are used, (19, 3, 3) their covariances for the update, the new ``rejected_for``, ``lean`` and
-        ``leaning``, and the greatest squared distance of a mean.
+        (19,) which points are used, and the new ``rejected_for``.
     """
-    count = len(measured)
     used, rejected_for = measured.copy(), rejected_for.copy()
-    blocks, lean, leaning = blocks.copy(), lean.copy(), leaning.copy()
-    fade, strain = math.exp(-dt / LEAN_TIME), 0.0
     # a limb may set off faster than it is expected to: what it can do in the time that passed is no outlier
     sudden = (0.5 * _SUDDEN * min(dt, _SUDDEN_TIME) ** 2) ** 2
-    for k in range(count):
-        y = innovation[3 * k : 3 * k + 3]
-        distance = squared_distance(blocks[k], y, 0.0)
+    for k in range(len(measured)):
         if measured[k]:
-            if squared_distance(blocks[k], y, sudden) < gate:
-                rejected_for[k] = 0.0
-            else:
-                # what stays where the person is not believed to be, and where no other pose is found, draws it slowly
-                used[k] = rejected_for[k] > reacquire_after
-                rejected_for[k] += dt
-                if used[k]:
-                    blocks[k] *= max(1.0, min(distance / _DRAWING, _MOST_GROWN))
-        weight = fade * leaning[k] + measured[k]
-        if measured[k]:
-            bounded = min(1.0, math.sqrt(gate / max(distance, 1e-9)))  # bounds the influence of an outlier
-            for i in range(3):
-                lean[k, i] += (bounded * y[i] - lean[k, i]) / max(weight, 1.0)
-        leaning[k] = weight
-        if weight > LEAN_FRAMES:
-            # variance of a faded mean of white innovations with this weight: only what is white averages out
-            averaged = white[k] * (1.0 - 1.0 / max((0.5 + 0.5 * fade) * weight, 1.0))
-            # a body is no model: what is off by less than the misfit needs no other pose
-            strain = max(strain, squared_distance(unstretched[k], lean[k], MISFIT**2 - averaged))
-    return used, blocks, rejected_for, lean, leaning, strain
+            used[k] = squared_distance(blocks[k], innovation[3 * k : 3 * k + 3], sudden) < gate
+            rejected_for[k] = 0.0 if used[k] else rejected_for[k] + dt
+    return used, rejected_for
 
 
 @compiled

@@ -8,7 +8,6 @@ from body_tracking.core import so3
 from body_tracking.core.body_model import ModelError
 from body_tracking.core.skeleton import BONES, NANOSECONDS, BoolArray, FloatArray, Joint
 from body_tracking.filters.ekf.algebra import CLOSE
-from body_tracking.filters.ekf.kernels import LEAN_FRAMES, MISFIT
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.sensor_errors import SensorErrors
 from body_tracking.filters.ekf.sources import PER_SOURCE
@@ -18,17 +17,11 @@ from body_tracking.kinematics.lengths import SegmentLengths
 
 _REST_NS = NANOSECONDS // 4
 """Least time between searches for another pose."""
-_MOST_ATTEMPTS = 4
-"""Greatest number of doublings of this time when the innovations soon persist again: sensors then contradict each
-other, and no pose fits all of them."""
-_SOON = 4
-"""Multiple of this time after which a search is independent of the last one."""
+_MISFIT = 0.02
+"""Metres: persistent distance of a person's points from any pose of the model."""
 _WHOLE = 15
 """Least number of points of a frame for an estimate of a person's size."""
 _MUCH_BETTER = 0.5
-_STRAINED = 4.0
-"""Squared Mahalanobis distance of a mean innovation that a right pose does not reach: it stays below 1 with little
-noise and below 3 with much."""
 _FIRST_SPEED, _FIRST_TURN_RATE = 0.3, 1.0
 """m/s and rad/s: standard deviation of the velocities of a person who is first seen."""
 _CONTRADICTION = 0.8
@@ -136,9 +129,6 @@ class PoseSearch:
             (),
             np.empty((size, 0), dtype=np.float32),
             np.zeros(space.points),
-            np.zeros((space.points, 3)),
-            np.zeros(space.points),
-            0.0,
             np.full(space.points, stamp_ns, dtype=np.intp),
             0.0,
             0.0 if previous is None else previous.tracked,
@@ -164,15 +154,7 @@ class PoseSearch:
         if back.any() and self._astray(state, measurement, back):
             points, stddev = self._as_fitted(measurement, state)
             return self._restarted(state, points, stddev, _MUCH_BETTER).but(attempted_ns=state.stamp_ns)
-        return self._looked_anew(state, measurement) if state.strain > _STRAINED else state
-
-    def _looked_anew(self, state: State, measurement: Measurement) -> State:
-        """Search for a better pose, more rarely after failed searches."""
-        elapsed, rest = state.stamp_ns - state.attempted_ns, _REST_NS << min(state.attempts, _MOST_ATTEMPTS)
-        if elapsed < rest:
-            return state
-        attempts = state.attempts + 1 if elapsed < _SOON * rest else 0
-        return self._straightened(state, measurement).but(attempted_ns=state.stamp_ns, attempts=attempts)
+        return state
 
     def _reacquired(self, state: State, measurement: Measurement) -> State:
         """Restart the pose if another one fits the rejected points much better."""
@@ -189,7 +171,7 @@ class PoseSearch:
     def _astray(self, state: State, measurement: Measurement, back: BoolArray) -> bool:
         """Whether an update by points (19,) that were away for long ended where they are not."""
         off = measurement.positions - self._model.forward(state.q, state.lengths).positions
-        variance = self._sensors.point_stddev(measurement, state.sensors) ** 2 + MISFIT**2
+        variance = self._sensors.point_stddev(measurement, state.sensors) ** 2 + _MISFIT**2
         return bool(((off**2).sum(axis=1) > self._gate * variance)[back].any())
 
     def _as_fitted(self, measurement: Measurement, state: State) -> tuple[FloatArray, FloatArray]:
@@ -223,20 +205,6 @@ class PoseSearch:
         self._counters["restarts"] += 1
         fit = self.inverse.solve(points, stddev, state.lengths, fit.q)
         return self.new_state(state.stamp_ns, fit.q, state.lengths, stddev, state)
-
-    def _straightened(self, state: State, measurement: Measurement) -> State:
-        """Restart the pose if another one fits the averaged points much better.
-
-        A wrong pose may persist that no single frame contradicts: a straight elbow with a wrong axial rotation of the
-        upper arm.
-        """
-        sure = state.leaning > LEAN_FRAMES
-        posture = self._model.forward(state.q, state.lengths)
-        points = np.where(sure[:, None], posture.positions + state.lean, np.nan)
-        stddev = self._sensors.point_stddev(measurement, state.sensors)
-        stddev = np.where(np.isfinite(stddev), np.sqrt(stddev**2 / np.maximum(state.leaning, 1.0) + MISFIT**2), np.inf)
-        state = state.but(lean=np.zeros_like(state.lean), leaning=np.zeros(self._space.points), strain=0.0)
-        return self._restarted(state, points, stddev, _MUCH_BETTER)
 
     def _lengths_of(self, points: FloatArray) -> FloatArray:
         """(21,) average proportions at the size of the person that is seen."""

@@ -45,7 +45,6 @@ class _Expected(NamedTuple):
         covariance: (57, 57) of the innovation.
         cross: (85, 57) covariance of the state with the innovation.
         own: (19, 3, 3) blocks of single points of the covariance, with what curvature adds.
-        unstretched: (19, 3, 3) the same without limbs that are too long or too short.
         limbs: (57, 4) displacement by the limbs' slow errors.
     """
 
@@ -54,7 +53,6 @@ class _Expected(NamedTuple):
     covariance: FloatArray
     cross: FloatArray
     own: FloatArray
-    unstretched: FloatArray
     limbs: FloatArray
 
 
@@ -122,28 +120,13 @@ class SkeletonUpdate:
             names, crosses = (*state.slow_names, measurement.sensor), np.concatenate([state.crosses, none], axis=1)
             state = state.but(slow_names=names, crosses=crosses)
         seen = self._expected(state, measurement, sensor)
-        used, blocks, rejected_for, lean, leaning, strain = gated(
-            seen.innovation,
-            seen.own,
-            seen.unstretched,
-            measurement.measured,
-            sensor.white,
-            state.rejected_for,
-            state.lean,
-            state.leaning,
-            dt,
-            self._gate,
-            self._parameters.reacquire_after,
-        )
+        used, rejected_for = gated(seen.innovation, seen.own, measurement.measured, state.rejected_for, dt, self._gate)
         count = int(np.count_nonzero(used))
         self._counters["measured"] += count
         self._counters["rejected"] += int(np.count_nonzero(measurement.measured)) - count
         state = state.but(
             rejected_for=rejected_for,
             used_ns=np.where(used, measurement.stamp_ns, state.used_ns),
-            lean=lean,
-            leaning=leaning,
-            strain=strain,
         )
         learnt = self._sensors.seen_by(sensor, measurement, used)
         if not count:
@@ -158,7 +141,7 @@ class SkeletonUpdate:
         far = reappeared or bool(state.sources.names) or state.tracked < _YOUNG
         for left in reversed(range(LINEARISATIONS if far else 1)):
             sound, whitening, gain, white, covariance = solved(
-                seen.covariance, blocks, seen.cross, seen.innovation, state.covariance, rows
+                seen.covariance, seen.own, seen.cross, seen.innovation, state.covariance, rows
             )
             if not sound:
                 raise np.linalg.LinAlgError("not positive definite")
@@ -168,9 +151,7 @@ class SkeletonUpdate:
                 break
             # Far from where it was linearised the measurement says something else: linearise it anew about what was
             # found (iterated posterior linearisation, Garcia-Fernandez et al. 2015).
-            grown = blocks[:, :1, :1] / seen.own[:, :1, :1]
             seen = self._expected(state, measurement, sensor, correction[: space.observed], covariance)
-            blocks = grown * seen.own
         unlearnt = self._orientations.unlearnt(state) if state.sources.names else None
         if unlearnt is not None:
             combinations, back = unlearnt

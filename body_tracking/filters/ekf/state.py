@@ -97,9 +97,6 @@ class State(Changeable):
             single precision: seven digits are enough for considered states, and with four cameras half the size of this
             largest matrix saves an eighth of a frame's time.
         rejected_for: (19,) seconds.
-        lean: (19, 3) metres, faded mean of the innovations, which shows wrong poses that no single frame shows.
-        leaning: (19,) effective number of innovations in it.
-        strain: greatest squared Mahalanobis distance of such a mean (chi-square with 3 degrees of freedom).
         used_ns: (19,) stamp of the last accepted measurement of each point.
         since_prior: seconds since ranges of motion were last applied.
         tracked: seconds since the start.
@@ -109,7 +106,6 @@ class State(Changeable):
         null: (k, 32) directions of the tangent that move no point.
         fresh: started from a frame, without any after it.
         attempted_ns: stamp of the last search for another pose.
-        attempts: number of such searches in close succession.
         sources: of orientations.
         oriented_ns: stamp of the last accepted orientation.
         unplaced: started by orientations, with an unknown position of the base.
@@ -125,9 +121,6 @@ class State(Changeable):
     slow_names: tuple[str, ...]
     crosses: SingleArray
     rejected_for: FloatArray
-    lean: FloatArray
-    leaning: FloatArray
-    strain: float
     used_ns: IntArray
     since_prior: float
     tracked: float
@@ -137,7 +130,6 @@ class State(Changeable):
     measured_at: float = 0.0
     fresh: bool = False
     attempted_ns: int = 0
-    attempts: int = 0
     sources: Sources = NOBODY
     oriented_ns: int = 0
     unplaced: bool = False
