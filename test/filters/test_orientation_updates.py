@@ -20,6 +20,7 @@ from body_tracking.core.body_model import SEGMENTS
 from body_tracking.core.compiled import LOOPS
 from body_tracking.core.orientation import SEGMENT_NUMBER, SegmentOrientation
 from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton
+from body_tracking.filters.ekf import orientations
 from body_tracking.filters.ekf import sources as orientation
 from body_tracking.filters.ekf.filter import ExtendedKalmanFilter, prepare
 from body_tracking.filters.ekf.parameters import EkfParameters
@@ -48,11 +49,8 @@ BODY = 85
 """Numbers of the state without any source."""
 PERFECT = EkfParameters(
     misalignment_stddev=1e-3,
-    misalignment_density=0.0,
     heading_stddev=1e-3,
-    heading_density=0.0,
     tissue_stddev=0.0,
-    orientation_noise=1e-3,
 )
 """For sources that do not err."""
 
@@ -187,7 +185,8 @@ def learnt(estimator: ExtendedKalmanFilter, source: Source) -> tuple[FloatArray,
 # --- compilation
 
 
-def test_no_frame_or_orientation_waits_for_the_compiler() -> None:
+def test_no_frame_or_orientation_waits_for_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(orientations, "_FORGET_AFTER_NS", NANOSECONDS // 2)
     prepare()
     before = sum(len(loop.signatures) for loop in LOOPS)
     person = worn_person(1, 4.0)
@@ -195,7 +194,7 @@ def test_no_frame_or_orientation_waits_for_the_compiler() -> None:
         replace(each, states=np.where(np.arange(N_JOINTS) < 8, 0, each.states).astype(np.uint8))
         for each in person.skeletons[50:55]
     ]
-    estimator = ExtendedKalmanFilter(EkfParameters(forget_after=0.5))
+    estimator = ExtendedKalmanFilter()
     sources = [Source(segment).measure(person) for segment in ("forearm_left", "hand_right", "upper_arm_left")]
     sources[1] = sources[1][:40]  # it is forgotten
     feed(estimator, in_order(person.skeletons[:50], hidden, person.skeletons[55:], *sources))
@@ -258,20 +257,20 @@ def test_what_is_expected_is_the_equation() -> None:
 
 def test_time_passes_over_the_covariance_of_sources_as_by_its_equation() -> None:
     rng = np.random.default_rng(2)
-    sources, p, dt, size = known_sources(rng), EkfParameters(), 0.3, 5 + 3 * PER_SOURCE
+    sources, dt, size = known_sources(rng), 0.3, 5 + 3 * PER_SOURCE
     root = rng.normal(size=(size, size))
     before = root @ root.T
     transition, noise = np.eye(size), np.zeros((size, size))
     for number in range(3):
         begin = 5 + PER_SOURCE * number
         slow = slice(begin + 4, begin + 7)
-        transition[slow, slow] *= np.exp(-dt / p.tissue_time)
-        noise[slow, slow] = (1.0 - np.exp(-2.0 * dt / p.tissue_time)) * sources.slow_variance[number]
-        walks = [*[p.misalignment_density] * 3, p.heading_density]
+        transition[slow, slow] *= np.exp(-dt / orientation.TISSUE_TIME)
+        noise[slow, slow] = (1.0 - np.exp(-2.0 * dt / orientation.TISSUE_TIME)) * sources.slow_variance[number]
+        walks = [*[orientation.MISALIGNMENT_DENSITY] * 3, orientation.HEADING_DENSITY]
         noise[range(begin, begin + 4), range(begin, begin + 4)] = dt * np.array(walks)
     after = before.copy()
-    share = orientation.advance(after, 5, sources, dt, p)
-    assert share == pytest.approx(np.exp(-dt / p.tissue_time))
+    share = orientation.advance(after, 5, sources, dt)
+    assert share == pytest.approx(np.exp(-dt / orientation.TISSUE_TIME))
     assert_allclose(after, transition @ before @ transition.T + noise, rtol=1e-12, atol=1e-12)
 
 
@@ -545,7 +544,7 @@ def test_a_new_source_has_not_slipped_with_its_second_word() -> None:
     person = worn_person(15, 1.0, 0.01)
     far = Source("forearm_left", misalignment=(1.2, 0.0, 0.0)).measure(person)
     estimator = ExtendedKalmanFilter(EkfParameters(orientation_rate=50.0))
-    soon = START_NS + round(0.8 * EkfParameters().slip_after * NANOSECONDS)
+    soon = START_NS + round(0.8 * orientations._SLIP_AFTER * NANOSECONDS)
     events = in_order(person.skeletons, far)
     feed(estimator, [each for each in events if each.stamp_ns < soon])
     assert estimator.counters["orientations_rejected"] > 5
@@ -567,7 +566,7 @@ def test_it_knows_how_sure_it_is_of_what_correlated_errors_leave(spin: float | N
                 tuple(p.misalignment_stddev * rng.normal(size=3)),
                 p.heading_stddev * rng.normal(),
                 float(np.hypot(p.tissue_stddev, 0.01)),
-                p.tissue_time,
+                orientation.TISSUE_TIME,
                 spin=spin,
             )
             for segment in (*FOREARMS, "upper_trunk")
@@ -584,13 +583,13 @@ def test_it_knows_how_sure_it_is_of_what_correlated_errors_leave(spin: float | N
 
 def test_angular_velocities_correct_velocities_and_nothing_else() -> None:
     person = worn_person(15, 2.0)
-    orientations = Source("forearm_left", (0.05, 0.0, 0.1), spin=0.05).measure(person)
-    estimator = ExtendedKalmanFilter(EkfParameters(rate_factor=0.0))
-    feed(estimator, in_order(person.skeletons, orientations))
+    measured = Source("forearm_left", (0.05, 0.0, 0.1), spin=0.05).measure(person)
+    estimator = ExtendedKalmanFilter()
+    feed(estimator, in_order(person.skeletons, [replace(each, angular_velocity=None) for each in measured]))
     without = estimator._state
     assert without is not None
     own = slice(BODY, BODY + PER_SOURCE)
-    quicker = replace(orientations[-1], angular_velocity=orientations[-1].angular_velocity + 0.1)
+    quicker = replace(measured[-1], angular_velocity=measured[-1].angular_velocity + 0.1)
     with_rates = ExtendedKalmanFilter()
     found = with_rates._orientations._spun_by(without, quicker, 0, own)
     assert_allclose(found.q, without.q, rtol=0.0, atol=0.0)
@@ -739,7 +738,10 @@ def test_a_fast_source_counts_no_more_often_than_it_may() -> None:
 
 
 @pytest.mark.parametrize(("name", "silent"), [("imu_forearm_left", 1.0), ("imu_head", 0.0)], ids=["another", "moved"])
-def test_a_source_that_is_silent_for_long_or_moves_to_another_segment_is_forgotten(name: str, silent: float) -> None:
+def test_a_source_that_is_silent_for_long_or_moves_to_another_segment_is_forgotten(
+    name: str, silent: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(orientations, "_FORGET_AFTER_NS", (1 if silent else 100) * NANOSECONDS)
     person = worn_person(9, 3.4)
     turn = START_NS + NANOSECONDS
     early = [each for each in Source("head").measure(person) if each.stamp_ns < turn]
@@ -748,7 +750,7 @@ def test_a_source_that_is_silent_for_long_or_moves_to_another_segment_is_forgott
         for each in Source("forearm_left").measure(person)
         if each.stamp_ns > turn + round(silent * NANOSECONDS)
     ]
-    estimator = ExtendedKalmanFilter(EkfParameters(forget_after=1.0 if silent else 100.0))
+    estimator = ExtendedKalmanFilter()
     feed(estimator, in_order(person.skeletons, early, late))
     state = estimator._state
     assert state is not None and state.sources.names == (name,)

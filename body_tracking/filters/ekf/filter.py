@@ -37,6 +37,8 @@ _START_FRAMES = 4
 """Frames of one sensor for an estimate of its noise."""
 _WAIT_NS = NANOSECONDS // 2
 """Frames farther apart than this do not make a start together."""
+_START_AFTER_NS = NANOSECONDS
+"""Without a skeleton for so long the body is started by orientations alone."""
 _PREPARED = 10
 """Frames after which all compiled functions have run."""
 _MAX_COORDINATE = 100.0
@@ -208,7 +210,7 @@ class ExtendedKalmanFilter:
     def take_orientation(self, measurement: SegmentOrientation) -> bool:
         """Take the orientation of one segment, at its own time among frames and others.
 
-        Where there are no skeletons, the body is started after ``start_after`` by orientations alone, its base at the
+        Where there are no skeletons, the body is started after a second by orientations alone, its base at the
         origin with the deviation of an unknown position. The first skeletons then restart it.
 
         Returns:
@@ -390,14 +392,14 @@ class ExtendedKalmanFilter:
     def _begun_turned(self, measurement: SegmentOrientation) -> bool:
         """Start the body by orientations alone, where no skeleton comes for some time."""
         since, stamp_ns = self._turned_since, measurement.stamp_ns
-        if since is None or abs(stamp_ns - since) > (self.parameters.start_after + 1.0) * NANOSECONDS:
+        if since is None or abs(stamp_ns - since) > _START_AFTER_NS + NANOSECONDS:
             self._turned_only, since = {}, stamp_ns
         self._turned_since = since = min(since, stamp_ns)
         latest = self._turned_only.get(measurement.source)
         if latest is None or latest.stamp_ns < stamp_ns:
             self._turned_only[measurement.source] = measurement
-        seen = self._waiting and abs(self._waiting[-1].stamp_ns - stamp_ns) < self.parameters.start_after * NANOSECONDS
-        if seen or stamp_ns - since < self.parameters.start_after * NANOSECONDS:
+        seen = self._waiting and abs(self._waiting[-1].stamp_ns - stamp_ns) < _START_AFTER_NS
+        if seen or stamp_ns - since < _START_AFTER_NS:
             return False
         together = [each for each in self._turned_only.values() if each.frame_id == measurement.frame_id]
         self._frame_id = measurement.frame_id

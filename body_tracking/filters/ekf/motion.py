@@ -14,6 +14,9 @@ from body_tracking.filters.ekf.sources import PER_SOURCE, advance
 from body_tracking.filters.ekf.state import State, StateSpace
 
 _SIDES, _ARM = ("left", "right"), ("shoulder", "elbow", "forearm", "wrist")
+_SLOW_TIME_BESIDE = 30.0
+"""Seconds for which slow errors of cameras persist beside orientations: where a camera takes a joint to be never
+changes, and over a shorter time it would be learnt as a pose, against what orientations say."""
 _OF_SPEED = 16.0
 """1/s: with orientations, additional density of a joint's acceleration per square of its speed. A limb swung twice a
 second has 4 pi times its speed as acceleration for about a tenth of a second; with too small a density the lag would be
@@ -29,7 +32,7 @@ _DENSITY = {
     "arm": 3.0,
 }
 """Spectral densities of accelerations, chosen on simulated people: m2/s3 of the base's place, rad2/s3 of the rest.
-People walk and turn at once, and hardly rise or tilt; neck and clavicles move as the spine, arm is shoulder to wrist."""
+People walk and turn at once, and hardly rise or tilt; neck and clavicles move as the spine; arm: shoulder to wrist."""
 _BESIDE_ORIENTATIONS = 50.0
 """rad2/s3: least density of the joints that turn a segment whose orientation is measured. Orientations are quick and
 need no smoothing; what a pose is too slow to follow would be taken for errors of their sources."""
@@ -85,7 +88,7 @@ class Motion:
         )
         sources = state.sources
         if sources.names:
-            share = advance(p, space.size, sources, dt, self._parameters)
+            share = advance(p, space.size, sources, dt)
             crosses.reshape(len(p), -1)[space.size :].reshape(len(sources), PER_SOURCE, -1)[:, 4:] *= share
             sources = sources.faded(share)
         return state.but(
@@ -118,8 +121,7 @@ class Motion:
 
     def _slow_time(self, state: State) -> float:
         """Seconds for which slow errors of cameras persist."""
-        p = self._parameters
-        return p.slow_time_beside_orientations if state.sources.names else p.slow_time
+        return _SLOW_TIME_BESIDE if state.sources.names else self._parameters.slow_time
 
     def _densities(self) -> tuple[FloatArray, FloatArray]:
         """(32, 32) which coordinates are of the same joint, and (32,) the density of each."""

@@ -14,7 +14,7 @@ from body_tracking.filters.ekf.algebra import CLOSE, FAR, LINEARISATIONS, whiten
 from body_tracking.filters.ekf.motion import Motion
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.priors import Priors
-from body_tracking.filters.ekf.sources import PER_SOURCE, about, expect, slipped
+from body_tracking.filters.ekf.sources import ORIENTATION_NOISE, PER_SOURCE, about, expect, slipped
 from body_tracking.filters.ekf.state import Measurement, State, StateSpace, single
 
 _AHEAD_OF = 0.8
@@ -22,6 +22,12 @@ _AHEAD_OF = 0.8
 _TOGETHER_NS = NANOSECONDS // 125
 """An orientation so soon after the state is compared with where that is heading for: it saves a prediction, and what
 the motion model adds in the meantime (1 mrad) comes with the next one."""
+_FORGET_AFTER_NS = 30 * NANOSECONDS
+"""A source that is silent for longer is forgotten."""
+_RATE_FACTOR = 3.0
+"""Angular velocities err by so many times what is stated, because they do so alike all the time."""
+_SLIP_AFTER = 0.4
+"""Seconds for which orientations do not fit before their sensor has slipped."""
 _SLIP_TIME = 0.5
 """Seconds over which innovations of orientations are summed, to detect a mean."""
 _SLIPPED = 30.0
@@ -67,7 +73,7 @@ class OrientationUpdate:
         if measurement.stamp_ns - state.stamp_ns > _TOGETHER_NS:
             state = self._motion.predicted(state, measurement.stamp_ns)
         segment = SEGMENT_NUMBER[measurement.segment]
-        active = measurement.stamp_ns - sources.stamps <= p.forget_after * NANOSECONDS
+        active = measurement.stamp_ns - sources.stamps <= _FORGET_AFTER_NS
         if number is not None:
             active[number] &= segment == sources.segments[number]
         if not active.all():
@@ -98,9 +104,9 @@ class OrientationUpdate:
         lean = lean + white * min(1.0, math.sqrt(self._gate / max(distance, 1e-9)))
         leaning += 1.0
         fits = near and float(lean @ lean) < _SLIPPED * leaning
-        passed = min(since, p.slip_after) if known else 0.0  # of a new one nothing has passed
+        passed = min(since, _SLIP_AFTER) if known else 0.0  # of a new one nothing has passed
         unfit_for = 0.0 if fits else float(sources.unfit_for[number]) + passed
-        if unfit_for > p.slip_after:
+        if unfit_for > _SLIP_AFTER:
             self._counters["slips"] += 1
             state = state.but(covariance=slipped(state.covariance, own, p))
             lean, leaning, unfit_for, near = np.zeros(3), 0.0, 0.0, True
@@ -152,7 +158,7 @@ class OrientationUpdate:
             if ahead > 0.0:
                 cross += by_tangent @ (ahead * state.covariance[v])
             s = (cross[:, t] + ahead * cross[:, v]) @ by_tangent.T + cross[:, own] @ by_source.T
-            s.reshape(-1)[::4] += self._parameters.orientation_noise**2
+            s.reshape(-1)[::4] += ORIENTATION_NOISE**2
             whitening = whitening_of(s)
             white = whitening @ innovation
             first = white if first is None else first
@@ -191,8 +197,8 @@ class OrientationUpdate:
         What it errs by (how the source sits, axes that are the person's own) it errs by alike all the time, and would
         teach the pose and its sources what is not so: these are considered but not corrected (Schmidt 1966).
         """
-        rate, p = measurement.angular_velocity, self._parameters
-        if rate is None or not p.rate_factor:
+        rate = measurement.angular_velocity
+        if rate is None:
             return state
         v = self._space.velocities
         rotation, turning = self._model.turning(state.q, int(state.sources.segments[number]))
@@ -201,7 +207,7 @@ class OrientationUpdate:
         misaligned = float(state.covariance.diagonal()[own][:3].mean())
         cross = turning @ state.covariance[v]
         s = cross[:, v] @ turning.T
-        s.reshape(-1)[::4] += p.rate_factor**2 * measurement.angular_velocity_variance + misaligned * float(rate @ rate)
+        s.reshape(-1)[::4] += _RATE_FACTOR**2 * measurement.angular_velocity_variance + misaligned * float(rate @ rate)
         whitening = whitening_of(s)
         white = whitening @ innovation
         if float(white @ white) > self._gate:

@@ -21,9 +21,6 @@ class EkfParameters(OrientationParameters):
     velocity_time: float = number_field(
         0.8, "time constant of the decay of velocities without measurements", "s", 0.05, 100.0
     )
-    white_stddev: float = number_field(
-        0.01, "standard deviation of a sensor's white noise before it is learnt", "m", 0.0005, 0.5
-    )
     slow_scale: float = number_field(
         0.3,
         "variance of the slow errors of a sensor that states covariances, as a share of these, before it is learnt",
@@ -53,9 +50,6 @@ class EkfParameters(OrientationParameters):
         "s",
         0.0,
         60.0,
-    )
-    settle_stddev: float = number_field(
-        0.003, "lengths stay as they are from when they are known as well as this", "m", 1e-5, 1.0
     )
     settle_time: float = number_field(60.0, "at the latest lengths stay as they are from this time on", "s", 0.1, 1e5)
     late_window: float = number_field(0.2, "frames that come late by no more than this still count", "s", 0.0, 2.0)

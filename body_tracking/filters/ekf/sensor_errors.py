@@ -13,6 +13,8 @@ from body_tracking.filters.ekf.state import Measurement, SensorState, State, Sta
 
 _DIMENSIONS = 3
 _MEAN = np.full(_DIMENSIONS, 1.0 / _DIMENSIONS)
+_FIRST_WHITE = 0.01
+"""Metres: standard deviation of a sensor's white noise before it is learnt."""
 _FLOOR = 1e-3
 """Metres: no sensor's white noise is taken for less."""
 _MAX_SLOW = 9.0
@@ -30,6 +32,9 @@ _OUTLYING = 6.0
 STRETCH = 0.067
 """Share of the length of an upper arm or forearm that a sensor that states covariances is wrong by: a Kinect v2's vary
 by 6.7 % (root mean square over clips of UI-PRMD)."""
+_BESIDE_ORIENTATIONS = 3.0
+"""Beside orientations the variance of slow errors is at least this share of what cameras state: what a camera is always
+wrong by alike passes for a body of other proportions as long as nothing but cameras sees it."""
 _ALONE = 0.1
 """Share of the parameter ``slow_scale`` for a sensor that no other one contradicts: with all of it the population's
 segment lengths outweigh the person's in the first seconds, and elbows err by 10 instead of 6 degrees
@@ -77,7 +82,7 @@ class SensorErrors:
         stated = measurement.skeleton.covariances is not None
         points = _ALONE * p.slow_scale if alone else p.slow_scale
         slow = points if stated else 0.0
-        white = np.full(space.points, p.white_stddev**2)
+        white = np.full(space.points, _FIRST_WHITE**2)
         return SensorState(
             (),
             np.empty((0, space.points, 3)),
@@ -140,7 +145,7 @@ class SensorErrors:
         """
         least = self.least_slow(sensor.white, measurement)
         if oriented and measurement.skeleton.covariances is not None:
-            least = max(least, self._parameters.slow_beside_orientations)
+            least = max(least, _BESIDE_ORIENTATIONS)
         # It changes slowly, and takes a while to compute.
         soon = sensor.stamps and measurement.stamp_ns // _SLOW_PERIOD_NS == sensor.stamps[-1] // _SLOW_PERIOD_NS
         # What is white is not known at first, and would be taken for slow.

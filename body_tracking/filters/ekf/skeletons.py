@@ -24,6 +24,8 @@ _MEAN_VARIANCE = _EYE3.reshape(-1) / 3.0
 """(9,) factors of a covariance, row by row."""
 _FORESEEABLE = 0.1
 """Metres: standard deviation of a predicted point up to which its innovation is used for slow errors."""
+_SETTLE_STDDEV = 0.003
+"""Metres: lengths stay as they are from when they are known as well as this."""
 _SETTLE_AFTER = 0.3
 """Share of the settle time before which no length stays: a person has to be seen in more than one pose."""
 _AWAY_NS = NANOSECONDS // 4
@@ -286,7 +288,7 @@ class SkeletonUpdate:
             return state
         state = state.but(measured_at=state.tracked)
         found = seen.estimate()
-        known = float(np.sqrt(found.covariance.diagonal()).max()) < self._parameters.settle_stddev
+        known = float(np.sqrt(found.covariance.diagonal()).max()) < _SETTLE_STDDEV
         if known and state.tracked > _SETTLE_AFTER * self._parameters.settle_time:
             state = state.but(seen=None)
         # The lengths' errors are new ones. What is known of the rest where the lengths are given stays as it is.

@@ -36,6 +36,14 @@ from body_tracking.kinematics.upper_body import UpperBody
 PER_SOURCE: Final = 7
 """Numbers of the state for each source: misalignment (3), heading, error that persists (3)."""
 _MISALIGNMENT, _HEADING, _SLOW = slice(0, 3), 3, slice(4, 7)
+TISSUE_TIME = 2.0
+"""Seconds for which errors of moving tissue persist."""
+MISALIGNMENT_DENSITY, HEADING_DENSITY = 3e-5, 3e-5
+"""rad2/s: of the random walks of misalignment and heading, the latter besides the growth that a source states."""
+ORIENTATION_NOISE = 0.01
+"""Radians: white noise per axis of each orientation that is used."""
+_SLIP_STDDEV = 0.35
+"""Radians by which a sensor may have slipped whose orientations do not fit any more."""
 _EYE3 = np.eye(3)
 _Z = np.array([0.0, 0.0, 1.0])
 _PARTS = np.array([0, 0, 0, 1])
@@ -71,22 +79,12 @@ class OrientationParameters:
         1e-4,
         3.0,
     )
-    misalignment_density: float = number_field(
-        3e-5, "orientations: spectral density of the random walk of the misalignment", "rad2/s", 0.0, 1.0
-    )
     heading_stddev: float = number_field(
         0.09,
         "orientations: error of a source's heading, before it is learnt, where the source states no more",
         "rad",
         1e-4,
         3.2,
-    )
-    heading_density: float = number_field(
-        3e-5,
-        "orientations: spectral density of the random walk of the heading, besides the growth that the source states",
-        "rad2/s",
-        0.0,
-        1.0,
     )
     tissue_stddev: float = number_field(
         0.05,
@@ -95,49 +93,8 @@ class OrientationParameters:
         0.0,
         1.0,
     )
-    tissue_time: float = number_field(2.0, "orientations: time for which errors of tissue persist", "s", 0.01, 1000.0)
-    orientation_noise: float = number_field(
-        0.01, "orientations: white noise of each that is used, per axis", "rad", 1e-5, 1.0
-    )
-    rate_factor: float = number_field(
-        3.0,
-        "orientations: angular velocities that come with them err by so many times what is stated, because they do so "
-        "alike all the time; 0 to use none",
-        "1",
-        0.0,
-        100.0,
-    )
     orientation_rate: float = number_field(
         30.0, "orientations: of a source that is faster no more than so many are used", "Hz", 1.0, 1000.0
-    )
-    slip_stddev: float = number_field(
-        0.35, "orientations: how far a sensor may have slipped whose orientations do not fit any more", "rad", 0.0, 3.2
-    )
-    slip_after: float = number_field(
-        0.4, "orientations: time for which they do not fit before the sensor has slipped", "s", 0.0, 60.0
-    )
-    forget_after: float = number_field(
-        30.0, "orientations: a source that is silent for longer is forgotten", "s", 0.1, 1e5
-    )
-    slow_beside_orientations: float = number_field(
-        3.0,
-        "orientations: beside them the variance of the slow errors of cameras is at least this share of what these "
-        "state: what a camera is always wrong by alike passes for a body of other proportions as long as nothing but "
-        "cameras sees it",
-        "1",
-        0.0,
-        9.0,
-    )
-    slow_time_beside_orientations: float = number_field(
-        30.0,
-        "orientations: time for which the slow errors of cameras persist beside them: where a camera takes a joint to "
-        "be never changes, and over a shorter time it would be learnt as a pose, against what orientations say",
-        "s",
-        0.05,
-        1000.0,
-    )
-    start_after: float = number_field(
-        1.0, "orientations: without a skeleton for so long the body is started by orientations alone", "s", 0.0, 60.0
     )
 
 
@@ -296,18 +253,16 @@ def _slow_variance(covariance: FloatArray, parameters: OrientationParameters) ->
     return variance
 
 
-def advance(
-    covariance: FloatArray, first: int, sources: Sources, dt: float, parameters: OrientationParameters
-) -> float:
+def advance(covariance: FloatArray, first: int, sources: Sources, dt: float) -> float:
     """Let time pass over the covariance (first + 7 n, ...) of all, in place; the share to which what persists fades."""
-    share = math.exp(-dt / parameters.tissue_time)
+    share = math.exp(-dt / TISSUE_TIME)
     fades = np.ones((len(sources), PER_SOURCE))
     fades[:, _SLOW] = share
     covariance[first:] *= fades.reshape(-1, 1)
     covariance[:, first:] *= fades.reshape(-1)
     added = np.zeros((len(sources), PER_SOURCE, PER_SOURCE))
     added[:, _SLOW, _SLOW] = (1.0 - share * share) * sources.slow_variance
-    added[:] += _WALKS[0] * (dt * parameters.misalignment_density) + _WALKS[1] * (dt * parameters.heading_density)
+    added[:] += _WALKS[0] * (dt * MISALIGNMENT_DENSITY) + _WALKS[1] * (dt * HEADING_DENSITY)
     own = covariance[first:, first:]
     for number, block in enumerate(added):
         place = slice(PER_SOURCE * number, PER_SOURCE * (number + 1))
@@ -323,7 +278,7 @@ def about(axis: FloatArray) -> FloatArray:
 def slipped(covariance: FloatArray, own: slice, parameters: OrientationParameters) -> FloatArray:
     """The covariance of all after a source (its ``own`` rows) has slipped, or was switched off and on."""
     covariance = covariance.copy()
-    variance = np.array([parameters.slip_stddev**2] * 3 + [parameters.heading_stddev**2] + [0.0] * 3)
+    variance = np.array([_SLIP_STDDEV**2] * 3 + [parameters.heading_stddev**2] + [0.0] * 3)
     covariance[own, own] += np.diag(variance)
     return covariance
 
