@@ -239,7 +239,9 @@ def test_orientations_alone_are_published_at_the_rate_of_predicted_frames(lag: f
         FilterSettings("ekf", sensors=SENSORS, lag=lag),
         lambda topic, payload, stamp_ns: published.append((topic, stamp_ns)),
     )
-    linear = PersonFilter(FilterSettings("lkf_constant_velocity"), lambda topic, payload, stamp_ns: None)
+    linear = PersonFilter(
+        FilterSettings("lkf_constant_velocity", sensors=SENSORS), lambda topic, payload, stamp_ns: None
+    )
     for time, posture in zip(times, rotations, strict=True):
         stamp_ns = START_NS + round(time * NANOSECONDS)
         for number, name in enumerate(("pelvis", "upper_trunk", "forearm_left")):
