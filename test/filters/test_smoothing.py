@@ -205,7 +205,9 @@ class Bench:
         self.published: list[tuple[str, int, int]] = []
         self.skeletons: list[Skeleton] = []
         self.now_ns = 0
-        self.filter = filter_of(FilterSettings(name, input=graph.FUSED_INPUT, **settings), self._publish)
+        self.filter = filter_of(
+            FilterSettings(name, input=graph.FUSED_INPUT, sensors=("kinect1",), **settings), self._publish
+        )
 
     def _publish(self, topic: str, payload: Any, stamp_ns: int) -> None:
         self.published.append((topic, stamp_ns, self.now_ns))
