@@ -28,6 +28,14 @@ PARAMETERS = (
     Parameter("rate", 1.0, "playback speed, recorded seconds per second", min=1e-3, max=1e4, live=True),
     Parameter("loop", False, "play again from the beginning at the end; /clock and stamps then jump back", live=True),
     Parameter("start_offset", 0.0, "skip this much at the beginning of the bag", unit="s", min=0.0),
+    Parameter(
+        "position",
+        0.0,
+        "set while the bag plays: continue at this place, seconds from its beginning",
+        unit="s",
+        min=0.0,
+        live=True,
+    ),
     Parameter("topics", (), "play only these topics; empty for all"),
     Parameter(
         "clock_rate",
@@ -66,7 +74,12 @@ class BagPlayer(GraphNode):
         if self.playback is not None:
             self.playback.set_rate(given["rate"], time.monotonic_ns())
             self.playback.loop = given["loop"]
-            self.wake(0)
+            if given["position"] != self.values["position"]:
+                if self.phase == "at the end":
+                    raise BagError("the bag has ended")
+                self.playback.seek(given["position"], time.monotonic_ns())
+            if self.phase == "playing":
+                self.wake(0)
 
     def start(self) -> None:
         """Open the bag and offer its topics."""
@@ -229,6 +242,7 @@ class BagPlayer(GraphNode):
                 "position s": f"{(self.clock_ns - self.reader.start_ns) / NANOSECONDS:.3f}",
                 "duration s": f"{(self.reader.end_ns - self.reader.start_ns) / NANOSECONDS:.3f}",
                 "rate": self.playback.rate,
+                "loop": self.playback.loop,
                 "sent": self.playback.sent,
                 "late ms": f"{self.playback.late_ns / 1e6:.3f}",
                 "loops": self.playback.loops,

@@ -25,7 +25,7 @@ from std_srvs.srv import Trigger
 from body_tracking import systems
 from body_tracking.core import names
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.core.parameters import Parameter
+from body_tracking.core.parameters import Parameter, Value
 from body_tracking.core.qos import LATCHED, LATEST, RELIABLE, Qos, request_for
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Skeleton
@@ -115,8 +115,9 @@ class ViewerNode(GraphNode):
         self.triggers = {each.name: self.create_client(Trigger, each.name) for each in systems.SERVICES}
         self.setters = {
             name: self.create_client(SetParametersAtomically, f"{name}/set_parameters_atomically")
-            for name in ("skeleton_filter", "joint_angles")
+            for name in ("skeleton_filter", "joint_angles", "bag_player")
         }
+        self.seeks = 0
         self.recent: dict[str, deque[tuple[bytes, int]]] = {}
         self.viewed: dict[str, tuple[Qos, Any]] = {}
         """Subscriptions of the views' topics, and their profiles."""
@@ -357,6 +358,18 @@ class ViewerNode(GraphNode):
             raise PageError(answer.message or f"{service}: refused")
         return str(answer.message) or "done"
 
+    def seek(self, place_s: float) -> str:
+        """Continue the bag at a place."""
+        self.seeks += 1
+        # a parameter that does not change is not applied, and the bag has gone on meanwhile
+        self.set_parameters_of("bag_player", position=place_s + 1e-6 * (self.seeks % 2))
+        return f"plays on from {place_s:.1f} s"
+
+    def loop(self, on: bool) -> str:
+        """Play the bag again at its end, or not."""
+        self.set_parameters_of("bag_player", loop=on)
+        return "begins again at its end" if on else "ends at its end"
+
     def choose_filter(self, name: str) -> str:
         """Change the filter, and the input and convention of the joint angles with it."""
         convention = ROLES[name].convention
@@ -393,7 +406,7 @@ class ViewerNode(GraphNode):
         ]
         return f"angles of {name}"
 
-    def set_parameters_of(self, node: str, **values: str) -> None:
+    def set_parameters_of(self, node: str, **values: Value) -> None:
         """Set parameters of another node, all or none; PageError where it refuses them or does not answer."""
         parameters = [RosParameter(name, value=value).to_parameter_msg() for name, value in values.items()]
         answer = self.ask(self.setters[node], SetParametersAtomically.Request(parameters=parameters))
@@ -425,6 +438,8 @@ class ViewerNode(GraphNode):
     def close(self) -> None:
         self.ended.set()
         self.thread.join(timeout=2.0)
+        if self.page.watched:
+            self.page.draw_end(self.statuses)
         self.page.close()
 
 

@@ -132,6 +132,21 @@ class Playback:
         self._anchor(steady_ns)
         self._rate = rate
 
+    def seek(self, start_offset_s: float, steady_ns: int) -> None:
+        """Continue at another place of the bag; as paused as before.
+
+        Raises:
+            BagError: there are no messages from there on; the place does not change then.
+        """
+        start_ns = self._reader.start_ns + round(start_offset_s * NANOSECONDS)
+        stream = self._reader.messages(self._topics, start_ns)
+        first = next(stream, None)
+        if first is None:
+            raise BagError(f"{self._reader.path}: no message to play after {start_offset_s:g} s")
+        self._stream, self._next, self._bag_ns = stream, first, start_ns
+        if self._steady_ns is not None:
+            self._steady_ns = self._next_tick_ns = steady_ns
+
     def step(self, steady_ns: int) -> Step:
         """The messages that are due.
 

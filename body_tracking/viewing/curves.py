@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from body_tracking.core.clocks import jumped_back
-from body_tracking.core.skeleton import NANOSECONDS, FloatArray, IntArray
+from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
 
 BAND: Final = 1.959963984540054
 """Half width of the 95 % band of a normal distribution, in standard deviations."""
@@ -75,6 +75,14 @@ class AngleHistory:
         self._rows.append((stamp_ns, np.degrees([positions, stddevs])))
         while self._rows[0][0] < stamp_ns - round(self.window * NANOSECONDS):
             self._rows.popleft()
+
+    def known(self) -> tuple[str, ...]:
+        """The angles that have a value and a finite standard deviation at any time that is shown."""
+        if not self._rows:
+            return ()
+        rows = np.array([row for _, row in list(self._rows)])
+        seen: BoolArray = np.isfinite(rows).all(axis=1).any(axis=0)
+        return tuple(name for name, there in zip(self.names, seen, strict=True) if there)
 
     def curve(self, name: str, count: int) -> Curve | None:
         """The curve of one angle, with at most ``count`` points; None without known values."""

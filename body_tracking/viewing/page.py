@@ -8,17 +8,16 @@ from __future__ import annotations
 import html
 import socket
 import threading
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
 from io import StringIO
 from typing import Any, Final
 
 import numpy as np
 import viser
-from viser import uplot
 
 from body_tracking.core import so3
-from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import Skeleton
 from body_tracking.messages.node_status import NodeStatus
@@ -32,8 +31,10 @@ from body_tracking.viewing.colours import (
     UNCERTAINTY,
     sensor_colours,
 )
-from body_tracking.viewing.curves import AngleHistory, first_choice
+from body_tracking.viewing.curves import AngleHistory
 from body_tracking.viewing.handles import BALL, STALE, TUBE, Drawn, Shapes, show
+from body_tracking.viewing.panel import ControlPanel
+from body_tracking.viewing.plots import Plots
 from body_tracking.viewing.same_origin import same_origin
 from body_tracking.viewing.shapes import (
     KINECT_VIEW,
@@ -41,17 +42,17 @@ from body_tracking.viewing.shapes import (
     ellipsoids,
     floor_height,
     in_world,
+    with_legs,
 )
 from body_tracking.viewing.snapshot import Controls, Decode, PageError, Seen, Snapshot, SystemView
 from body_tracking.viewing.status import table
 
-PLOTS: Final = 4
-"""Number of plots."""
+_LAST_S: Final = 0.3
+"""Seconds for the browsers to receive the last text."""
+WIDTH: Final = 290
+"""Pixels of each panel beside the scene, so that it has 440 of a tablet's 1024."""
 _STOP_S: Final = 2.0
 """Time limit for stopping the server, seconds."""
-
-POINTS: Final = 200
-"""Points of a plotted curve at most: about one per two pixels."""
 
 _INITIAL_TARGET: Final = np.array([2.2, 0.0, 0.0])
 """Point at which the camera looks before a person is seen: in front of the reference sensor, metres in world."""
@@ -64,18 +65,11 @@ LAYERS: Final[Mapping[str, tuple[str, bool]]] = {
     "fused": ("fused skeleton", False),
     "filtered": ("filtered skeleton", True),
     "body": ("body", True),
-    "uncertainty": ("95 % ellipsoids", True),
+    "uncertainty": ("95 % ellipsoids", False),
     "frames": ("frames of segments", False),
     "floor": ("floor", True),
 }
 """Layers of the scene by name: label, and whether it is visible at first."""
-
-BUTTONS: Final[Mapping[str, Mapping[str, str]]] = {
-    "calibration": {"calibrate": "calibration/start", "reset": "calibration/reset"},
-    "recording": {"record": "recorder/start", "stop": "recorder/stop"},
-    "bag": {"pause": "bag_player/pause", "resume": "bag_player/resume"},
-}
-"""Groups of buttons, and the service that each button calls."""
 
 
 class Page:
@@ -213,8 +207,11 @@ class Page:
                 standing += placed if not seen.stale else ()
                 drawn.draw(Seen(placed, seen.stale), self.visible["sensors"])
             self._drawn["fused"].draw(snapshot.fused, self.visible["fused"])
-            self._drawn["filtered"].draw(snapshot.filtered, self.visible["filtered"])
-            self._draw_body(snapshot.filtered)
+            others = (*(() if snapshot.fused.stale else snapshot.fused.skeletons), *standing)
+            whole = tuple(with_legs(each, others) for each in snapshot.filtered.skeletons)
+            filtered = Seen(whole, snapshot.filtered.stale)
+            self._drawn["filtered"].draw(filtered, self.visible["filtered"])
+            self._draw_body(filtered)
             self._draw_uncertainty(snapshot)
             self._draw_frames(snapshot)
             self._floor = floor_height([*standing, *snapshot.filtered.skeletons], self._floor)
@@ -275,24 +272,19 @@ class Page:
         gui = self._server.gui
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=PALETTE[0])
         gui.main_panel.dock_right()
-        gui.main_panel.set_width(330)
+        gui.main_panel.set_width(WIDTH)
+        self._panel = ControlPanel(self._server, self._controls, filters, conventions)
         self._legend = gui.add_html(self._legend_text())
-        with gui.add_folder("Control"):
-            for label, services in BUTTONS.items():
-                self._buttons(label, services)
-            self._filter = self._choice("filter", filters, self._controls.choose_filter)
-            self._convention = self._choice("angles", conventions, self._controls.choose_convention)
-            self._body = self._choice("person", (_NONE,), self._controls.choose_body)
-        with gui.add_folder("Show"):
+        with gui.add_folder("Nodes"):
+            self._table = gui.add_html("no diagnostics yet")
+        with gui.add_folder("Show", expand_by_default=False):
             for name, (label, shown) in self._choices.items():
                 self._checkbox(name, label, shown)
         angles = gui.add_panel()
         with angles.add_tab("Joint angles", viser.Icon.CHART_LINE):
-            self._plots = [_Plot(gui, window) for _ in range(PLOTS)]
+            self._plots = Plots(gui, window)
         angles.dock_left()
-        angles.set_width(330)
-        with gui.add_folder("Nodes"):
-            self._table = gui.add_html("no diagnostics yet")
+        angles.set_width(WIDTH)
 
     def _legend_text(self) -> str:
         entries = [*self._colours.items(), ("filtered", FILTERED), ("inferred or not tracked", INFERRED)]
@@ -303,24 +295,6 @@ class Page:
         )
         return f"<div style='font-size:0.8em;padding:0.3em 0.6em'>{dots}</div>"
 
-    def _buttons(self, label: str, services: Mapping[str, str]) -> None:
-        buttons = self._server.gui.add_button_group(label, tuple(services))
-
-        @buttons.on_click
-        def _(event: viser.GuiEvent[Any]) -> None:
-            pressed = buttons.value
-            self._answer(f"{label}: {pressed}", lambda: self._controls.call(services[pressed]))
-
-    def _choice(self, label: str, options: Sequence[str], choose: Callable[[str], str]) -> Any:
-        dropdown = self._server.gui.add_dropdown(label, tuple(options))
-
-        @dropdown.on_update
-        def _(event: viser.GuiEvent[Any]) -> None:
-            if event.client is not None:  # None for updates by draw_status and draw_bodies
-                self._answer(label, lambda: choose(dropdown.value))
-
-        return dropdown
-
     def _checkbox(self, layer: str, label: str, shown: bool) -> None:
         checkbox = self._server.gui.add_checkbox(label, shown)
 
@@ -328,93 +302,27 @@ class Page:
         def _(event: viser.GuiEvent[Any]) -> None:
             self.visible[layer] = checkbox.value
 
-    def _answer(self, what: str, ask: Callable[[], str]) -> None:
-        """Show all clients the request, and then its answer or the reason of its refusal."""
-        clients = self._server.get_clients().values()
-        notes = [client.add_notification(what, "waits for an answer", loading=True) for client in clients]
-        try:
-            text, refused = ask(), False
-        except BodyTrackingError as error:
-            text, refused = str(error), True
-        for note in notes:
-            note.body, note.color = text, "red" if refused else "teal"
-            note.loading, note.auto_close_seconds = False, 8.0
-
     # --- slow updates
 
     def draw_curves(self, history: AngleHistory) -> None:
         """Show the chosen angles."""
         with self._server.atomic():
-            for plot, name in zip(self._plots, first_choice(history.names, PLOTS), strict=False):
-                plot.draw(history, name)
+            self._plots.draw(history)
 
     def draw_status(self, statuses: Mapping[str, NodeStatus], now: float) -> None:
-        """Show the nodes' diagnostics, and the running filter and convention."""
+        """Show the nodes' diagnostics, and the controls that one of them answers."""
+        self._panel.draw(statuses, now, ended=False)
         self._table.content = table(statuses, now)
-        for node, dropdown in (("skeleton_filter", self._filter), ("joint_angles", self._convention)):
-            running = statuses[node].text.partition(" ")[0] if node in statuses else ""
-            if running in dropdown.options and dropdown.value != running:
-                dropdown.value = running
+
+    def draw_end(self, statuses: Mapping[str, NodeStatus]) -> None:
+        """Say that the graph has ended, which stays in the browsers."""
+        self._panel.draw(statuses, 0.0, ended=True)
+        self._server.flush()
+        time.sleep(_LAST_S)
 
     def draw_bodies(self, bodies: Sequence[str], chosen: str) -> None:
         """Update the list of persons with angles."""
-        options = tuple(bodies) or (_NONE,)
-        if self._body.options != options:
-            self._body.options = options
-        if chosen in options and self._body.value != chosen:
-            self._body.value = chosen
-
-
-class _Plot:
-    """A plot of one angle with its band, which the user chooses.
-
-    Args:
-        gui: to add it to.
-        window: seconds.
-    """
-
-    def __init__(self, gui: viser.GuiApi, window: float) -> None:
-        self._choice: Any = gui.add_dropdown("angle", (_NONE,))
-        self._chosen = False
-        empty = np.array([-window, 0.0])
-        nothing = np.zeros(2)
-        hidden = uplot.Series(label="", stroke="rgba(0,0,0,0)", width=0.0, points={"show": False})
-        self._plot = gui.add_uplot(
-            (empty, nothing, nothing, nothing),
-            (
-                uplot.Series(label="s"),
-                uplot.Series(label="deg", stroke="rgb(38,108,190)", width=1.6, points={"show": False}),
-                hidden,
-                hidden,
-            ),
-            bands=(uplot.Band(series=(3, 2), fill="rgba(38,108,190,0.18)"),),
-            scales={"x": uplot.Scale(time=False, range=(-window, 0.0)), "y": uplot.Scale(auto=True)},
-            axes=(uplot.Axis(size=30), uplot.Axis(size=40)),
-            legend=uplot.Legend(show=False),
-            height=118,
-            padding=(6, 8, 0, 0),
-        )
-
-        @self._choice.on_update
-        def _(event: viser.GuiEvent[Any]) -> None:
-            self._chosen = self._chosen or event.client is not None
-
-    def draw(self, history: AngleHistory, usual: str) -> None:
-        """Show the chosen angle, or ``usual`` before the user has chosen one."""
-        if self._choice.options != history.names:
-            kept = self._choice.value if self._chosen else usual
-            self._chosen = self._chosen and kept in history.names
-            self._choice.options = history.names
-            self._choice.value = kept if kept in history.names else usual
-        curve = history.curve(self._choice.value, POINTS)
-        if curve is not None:
-            self._plot.data = (curve.times, curve.values, curve.low, curve.high)
-            now = f"{curve.values[-1]:.1f}°"
-            known = np.isfinite(curve.latest_stddev)
-            self._choice.label = f"{now} ± {1.96 * curve.latest_stddev:.1f}°" if known else f"{now} ± ?"
-
-
-_NONE: Final = "none yet"
+        self._panel.draw_bodies(bodies, chosen)
 
 
 def _check_address(host: str) -> None:

@@ -122,6 +122,32 @@ def in_world(skeleton: Skeleton, pose: SensorPose) -> Skeleton:
     return Skeleton(skeleton.stamp_ns, "world", placed, skeleton.states, skeleton.body)
 
 
+_LEGS: Final[IntArray] = np.arange(Joint.HIP_LEFT, Joint.FOOT_RIGHT + 1, dtype=np.intp)
+_SAME_BODY: Final = 0.5
+"""Largest distance of two estimates of a body's trunk, metres."""
+
+
+def with_legs(skeleton: Skeleton, others: Sequence[Skeleton]) -> Skeleton:
+    """The skeleton of a filter that has no legs, with those of the same body in another skeleton.
+
+    Args:
+        skeleton: in world.
+        others: in world, the best first.
+    """
+    missing = _LEGS[~skeleton.valid[_LEGS]]
+    for other in others:
+        both = skeleton.valid & other.valid
+        if len(missing) == 0 or not both.any():
+            continue
+        apart = np.linalg.norm(skeleton.positions[both] - other.positions[both], axis=1)
+        if np.median(apart) > _SAME_BODY:
+            continue
+        positions, states = skeleton.positions.copy(), skeleton.states.copy()
+        positions[missing], states[missing] = other.positions[missing], other.states[missing]
+        return Skeleton(skeleton.stamp_ns, skeleton.frame_id, positions, states, skeleton.body)
+    return skeleton
+
+
 def figure(skeletons: Sequence[Skeleton], own: Colour) -> Figure:
     """The joints that have a position, and the bones between them.
 

@@ -26,6 +26,12 @@ class Controls(Protocol):
     def call(self, service: str) -> str:
         """Call a ``std_srvs/Trigger``."""
 
+    def seek(self, place_s: float) -> str:
+        """Continue the bag at this place, seconds from its beginning."""
+
+    def loop(self, on: bool) -> str:
+        """Play the bag again at its end, or not."""
+
     def choose_filter(self, name: str) -> str:
         """Switch the filter."""
 

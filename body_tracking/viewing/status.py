@@ -12,18 +12,22 @@ FRESH: Final = 3.0
 """Seconds after which a node counts as silent; nodes publish diagnostics once a second."""
 
 _COLOURS: Final = {0: "#2f9e44", 1: "#f08c00", 2: "#e03131"}
+_NONE: Final = "&ndash;"
 _SILENT: Final = "#adb5bd"
 
 
 def _rate(status: NodeStatus) -> str:
-    """Messages per second of the node's busiest output; empty where it has none."""
-    rates = [status.number(name) for name in status.values if name.startswith("rate out ")]
-    known = [rate for rate in rates if rate is not None]
-    return f"{max(known):.0f} Hz" if known else ""
+    """Messages per second of the node's busiest output, else of its busiest input; a dash where it has neither."""
+    for way in ("rate out ", "rate in "):
+        rates = [status.number(name) for name in status.values if name.startswith(way)]
+        known = [rate for rate in rates if rate is not None]
+        if known:
+            return f"{max(known):.0f} Hz"
+    return _NONE
 
 
 def _milliseconds(value: float | None) -> str:
-    return "" if value is None else f"{value:.1f} ms"
+    return _NONE if value is None else f"{value:.1f} ms"
 
 
 def table(statuses: Mapping[str, NodeStatus], now: float) -> str:

@@ -80,6 +80,8 @@ def test_a_browser_shows_the_graph_and_its_buttons_work(browser: Browser, tmp_pa
     browser.until(drawn, "the filtered skeleton as it was published")
     first = browser.joints("/filtered/joints")
     browser.until(lambda: not np.allclose(browser.joints("/filtered/joints"), first, atol=1e-3), "it to move")
+    assert browser.joints("/uncertainty") is None
+    page.get_by_label("95 % ellipsoids").dispatch_event("click")
     for name in ("/sensors/kinect1/skeleton/joints", "/sensors/kinect2/skeleton/joints", "/uncertainty"):
         browser.until(lambda name=name: browser.joints(name) is not None, name)
 
@@ -92,7 +94,11 @@ def test_a_browser_shows_the_graph_and_its_buttons_work(browser: Browser, tmp_pa
         assert (np.diff(times) > 0.0).all() and times[-1] == 0.0
         assert (np.array(low) <= values).all() and (np.array(values) <= high).all()
 
-    # The nodes say how they are.
+    for label in ("left elbow flexion", "right shoulder elevation"):
+        assert page.locator(f"input[value='{label}']").count()
+
+    # The nodes say how they are, and the state is in words.
+    browser.until(lambda: re.search(r"playing tpose_torso_twist, [\d.]+ of", page.inner_text("body")), "the bag's name")
     browser.until(lambda: re.search(r"skeleton_filter\s+\d+ Hz", page.inner_text("body")), "rates of the nodes")
     if PICTURES:
         browser.until(lambda: any(plot[0][0] < -9.0 for plot in curves()), "a picture with something to see")
@@ -128,20 +134,24 @@ def test_a_browser_shows_the_graph_and_its_buttons_work(browser: Browser, tmp_pa
         assert {graph.skeleton_topic("kinect1"), graph.FILTERED, graph.DIAGNOSTICS_TOPIC} <= set(reader.topics)
         assert sum(1 for _ in reader.messages([graph.FILTERED])) > 10
 
-    # What cannot be done is said, with the reason.
+    # The bag goes where its slider is moved.
+    def follows() -> bool:
+        return float(running.diagnostics.get("bag_player", {}).get("position s", 0)) > 12.0
+
+    browser.press("pause")
+    browser.until(lambda: re.search(r"paused tpose_torso_twist", page.inner_text("body")), "a paused bag")
+    page.get_by_role("slider").first.press("End")
+    browser.answer("plays on from")
+    browser.until(follows, "the bag at its end")
+
+    # What no node offers is not on the page, and an end is said.
     assert stop(running.processes.pop("bag_recorder")) == 0
-    browser.until(lambda: not services_of(running, "bag_recorder"), "the recorder to be gone")
-    browser.press("record")
-    assert "no node that offers it runs" in browser.answer("no node that offers it")
+    browser.until(lambda: not page.get_by_role("button", name="record", exact=True).count(), "no button without a node")
+    assert stop(running.processes.pop("viewer")) == 0
+    browser.until(lambda: "The graph has ended" in page.inner_text("body"), "the end in words")
+    assert not page.get_by_role("button", name="calibrate", exact=True).count()
 
 
 def _spin(executor: SingleThreadedExecutor) -> None:
     with contextlib.suppress(ExternalShutdownException, ShutdownException):
         executor.spin()
-
-
-def services_of(running: Running, node: str) -> list[Any]:
-    """What a node offers; nothing when it is gone."""
-    if node not in running.node.get_node_names():
-        return []
-    return list(running.node.get_service_names_and_types_by_node(node, "/"))

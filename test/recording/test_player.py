@@ -183,6 +183,22 @@ def test_a_bag_of_one_instant_does_not_spin(tmp_path, stored):
         assert 50 < len(run.sent) <= 101
 
 
+def test_seek_continues_at_another_place_forwards_and_back(reader, stored):
+    run = Run(Playback(reader, start_offset_s=0.405))
+    begun = [raw.log_time_ns for raw in reader.messages()]
+    run.playback.step(0)
+    run.playback.seek(0.0, 0)
+    assert [each.log_time_ns for batch in run.playback.step(0).batches for each in batch.messages] == begun[:1]
+    with pytest.raises(BagError, match="after 60 s"):
+        run.playback.seek(60.0, 0)
+    run.playback.pause(0)
+    run.playback.seek((begun[-1] - begun[0]) / 1e9, 0)
+    assert not run.playback.step(10**9).batches[0].messages
+    run.playback.resume(10**9)
+    (last,) = run.playback.step(10**9).batches[-1].messages
+    assert last.log_time_ns == begun[-1]
+
+
 def test_start_offset_and_selection_of_topics(reader, stored):
     run = Run(Playback(reader, start_offset_s=0.405))
     run.to_the_end()

@@ -164,3 +164,15 @@ def test_the_floor_is_under_the_feet_and_keeps_still() -> None:
     inferred = feet_at(-5.0)
     inferred.states[:] = 1
     assert shapes.floor_height([inferred], floor) == floor
+
+
+def test_a_filter_without_legs_gets_those_of_the_same_body() -> None:
+    whole = standing(np.random.default_rng(5))
+    positions = whole.positions.copy()
+    positions[Joint.HIP_LEFT : Joint.FOOT_RIGHT + 1] = np.nan
+    upper = Skeleton(0, "world", positions + 0.02, whole.states)
+    far = Skeleton(0, "world", whole.positions + 1.0, whole.states)
+    drawn = shapes.with_legs(upper, [far, whole])
+    assert drawn.positions[Joint.KNEE_LEFT] == pytest.approx(whole.positions[Joint.KNEE_LEFT])
+    assert drawn.positions[Joint.HEAD] == pytest.approx(upper.positions[Joint.HEAD])
+    assert shapes.with_legs(upper, [far]) is upper and shapes.with_legs(whole, [far]) is whole

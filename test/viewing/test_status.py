@@ -24,7 +24,11 @@ def test_a_silent_node_has_no_figures_any_more() -> None:
 
 @pytest.mark.parametrize(
     ("values", "rate"),
-    [({}, ""), ({"rate out /a": "fast", "rate out /b": "3.0", "delay median ms": "n/a"}, "3 Hz")],
+    [
+        ({}, ""),
+        ({"rate in /a": "7.0"}, "7 Hz"),
+        ({"rate out /a": "fast", "rate out /b": "3.0", "delay median ms": "n/a"}, "3 Hz"),
+    ],
 )
 def test_a_figure_that_is_none_is_left_out(values: dict[str, str], rate: str) -> None:
     text = table({"fusion": NodeStatus("fusion: stream", 0, "", values)}, 0.0)

@@ -1,0 +1,142 @@
+"""The controls of the page: state of the graph, buttons, the bag's place, and choices."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
+
+import viser
+
+from body_tracking.core.errors import BodyTrackingError
+from body_tracking.messages.node_status import NodeStatus
+from body_tracking.viewing.handles import show
+from body_tracking.viewing.plots import NONE
+from body_tracking.viewing.snapshot import Controls
+from body_tracking.viewing.state import CALIBRATION, PLAYER, RECORDER, fresh, state_html
+
+BUTTONS: Final[Mapping[str, tuple[str, Mapping[str, str]]]] = {
+    "calibration": (CALIBRATION, {"calibrate": "calibration/start", "reset": "calibration/reset"}),
+    "recording": (RECORDER, {"record": "recorder/start", "stop": "recorder/stop"}),
+    "bag": (PLAYER, {"pause": "bag_player/pause", "resume": "bag_player/resume"}),
+}
+"""Groups of buttons: the node that answers, and the service that each button calls."""
+
+_REST_S: Final = 0.4
+"""Seconds for which the slider must rest before the bag goes there."""
+_HELD_S: Final = 2.5
+"""Seconds after a move by the user in which the slider does not follow the bag: until its next diagnostics."""
+
+
+class ControlPanel:
+    """Makes the controls, and shows those that a node answers.
+
+    Args:
+        server: of the page.
+        controls: called when a user presses a button or chooses an option.
+        filters: options.
+        conventions: options.
+    """
+
+    def __init__(
+        self, server: viser.ViserServer, controls: Controls, filters: Sequence[str], conventions: Sequence[str]
+    ) -> None:
+        self._server, self._controls = server, controls
+        gui = server.gui
+        self._state = gui.add_html(state_html({}, 0.0))
+        self._groups: dict[str, list[Any]] = {}
+        with gui.add_folder("Control"):
+            for label, (node, services) in BUTTONS.items():
+                self._groups.setdefault(node, []).append(self._buttons(label, services))
+            self._place: Any = gui.add_slider("time [s]", 0.0, 1.0, 0.1, 0.0, visible=False)
+            self._loop: Any = gui.add_checkbox("loop", False, visible=False)
+            self._groups[PLAYER] += [self._place, self._loop]
+            self._filter = self._choice("filter", filters, self._controls.choose_filter)
+            self._convention = self._choice("angles", conventions, self._controls.choose_convention)
+            self._body = self._choice("person", (NONE,), self._controls.choose_body)
+            self._groups["skeleton_filter"], self._groups["joint_angles"] = [self._filter], [self._convention]
+        self._moved, self._resting = -_HELD_S, threading.Timer(0.0, lambda: None)
+        self._place.on_update(self._on_place)
+        self._loop.on_update(self._on_loop)
+
+    def draw(self, statuses: Mapping[str, NodeStatus], now: float, ended: bool) -> None:
+        """Show the state, and what runs."""
+        self._state.content = state_html(statuses, now, ended)
+        there = {} if ended else fresh(statuses, now)
+        for node, controls in self._groups.items():
+            for each in controls:
+                show(each, node in there)
+        for node, dropdown in (("skeleton_filter", self._filter), ("joint_angles", self._convention)):
+            running = there[node].text.partition(" ")[0] if node in there else ""
+            if running in dropdown.options and dropdown.value != running:
+                dropdown.value = running
+        if (player := there.get(PLAYER)) is not None:
+            self._follow(player)
+
+    def _follow(self, player: NodeStatus) -> None:
+        """Move the slider to the bag's place, unless the user moves it."""
+        length, place = player.number("duration s") or 0.0, player.number("position s") or 0.0
+        last = max(0.1, int(10.0 * length) / 10.0)  # not after the last message
+        if self._place.max != last:
+            self._place.max = last
+        if time.monotonic() - self._moved > _HELD_S:
+            self._place.value = min(max(0.0, round(place, 1)), self._place.max)
+            self._loop.value = player.values.get("loop") == "True"
+
+    def draw_bodies(self, bodies: Sequence[str], chosen: str) -> None:
+        """Update the list of persons with angles."""
+        options = tuple(bodies) or (NONE,)
+        if self._body.options != options:
+            self._body.options = options
+        if chosen in options and self._body.value != chosen:
+            self._body.value = chosen
+
+    def _on_place(self, event: viser.GuiEvent[Any]) -> None:
+        if event.client is None:  # by draw
+            return
+        self._moved = time.monotonic()
+        self._resting.cancel()
+        self._resting = threading.Timer(_REST_S, self._seek, (float(self._place.value),))
+        self._resting.daemon = True
+        self._resting.start()
+
+    def _seek(self, place: float) -> None:
+        self._answer("bag: time", lambda: self._controls.seek(place))
+
+    def _on_loop(self, event: viser.GuiEvent[Any]) -> None:
+        if event.client is not None:
+            self._moved = time.monotonic()
+            self._answer("bag: loop", lambda: self._controls.loop(bool(self._loop.value)))
+
+    def _buttons(self, label: str, services: Mapping[str, str]) -> Any:
+        buttons = self._server.gui.add_button_group(label, tuple(services), visible=False)
+
+        @buttons.on_click
+        def _(event: viser.GuiEvent[Any]) -> None:
+            pressed = buttons.value
+            self._answer(f"{label}: {pressed}", lambda: self._controls.call(services[pressed]))
+
+        return buttons
+
+    def _choice(self, label: str, options: Sequence[str], choose: Callable[[str], str]) -> Any:
+        dropdown = self._server.gui.add_dropdown(label, tuple(options))
+
+        @dropdown.on_update
+        def _(event: viser.GuiEvent[Any]) -> None:
+            if event.client is not None:  # None for updates by draw and draw_bodies
+                self._answer(label, lambda: choose(dropdown.value))
+
+        return dropdown
+
+    def _answer(self, what: str, ask: Callable[[], str]) -> None:
+        """Show all clients the request, and then its answer or the reason of its refusal."""
+        clients = self._server.get_clients().values()
+        notes = [client.add_notification(what, "waits for an answer", loading=True) for client in clients]
+        try:
+            text, refused = ask(), False
+        except BodyTrackingError as error:
+            text, refused = str(error), True
+        for note in notes:
+            note.body, note.color = text, "red" if refused else "teal"
+            note.loading, note.auto_close_seconds = False, 8.0

@@ -1,0 +1,108 @@
+"""Curves of joint angles beside the scene: those of a limb, or each as the user chooses."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+import viser
+from viser import uplot
+
+from body_tracking.kinematics.labels import by_limb, label_of
+from body_tracking.viewing.curves import BAND, AngleHistory, first_choice
+
+PLOTS: Final = 4
+"""Number of plots."""
+POINTS: Final = 200
+"""Points of a plotted curve at most: about one per two pixels."""
+HEIGHT: Final = 92
+"""Pixels of a plot, so that all are seen in a window of 720."""
+NONE: Final = "none yet"
+_USUAL: Final = "elbows and shoulders"
+
+
+class Plots:
+    """The plots; only angles that are known can be chosen.
+
+    Args:
+        gui: of the page.
+        window: seconds that the plots show.
+    """
+
+    def __init__(self, gui: viser.GuiApi, window: float) -> None:
+        self._limb: Any = gui.add_dropdown("show", (_USUAL,))
+        self._shown = ""
+        self._known: tuple[str, ...] = ()
+        self._plots = [_Plot(gui, window) for _ in range(PLOTS)]
+
+    def draw(self, history: AngleHistory) -> None:
+        """Show the chosen angles."""
+        known = history.known()
+        # an angle that is lost stays in the lists until others come
+        if not set(known) <= set(self._known) or set(self._known) - set(history.names):
+            self._known = tuple(name for own in by_limb(known).values() for name in own)
+            limbs = (_USUAL, *by_limb(known))
+            if self._limb.options != limbs:
+                kept = self._limb.value
+                self._limb.options = limbs
+                self._limb.value = kept if kept in limbs else _USUAL
+            self._shown = ""
+        limb = self._limb.value
+        if limb != self._shown:
+            own = by_limb(self._known).get(limb) or first_choice(self._known, PLOTS)
+            for place, plot in enumerate(self._plots):
+                plot.offer(self._known, own[place] if place < len(own) else "")
+            self._shown = limb
+        for plot in self._plots:
+            plot.draw(history)
+
+
+class _Plot:
+    """A plot of one angle with its band, which the user may choose.
+
+    Args:
+        gui: to add it to.
+        window: seconds.
+    """
+
+    def __init__(self, gui: viser.GuiApi, window: float) -> None:
+        self._names: dict[str, str] = {}
+        self._choice: Any = gui.add_dropdown("angle", (NONE,))
+        empty = np.array([-window, 0.0])
+        nothing = np.zeros(2)
+        hidden = uplot.Series(label="", stroke="rgba(0,0,0,0)", width=0.0, points={"show": False})
+        self._plot = gui.add_uplot(
+            (empty, nothing, nothing, nothing),
+            (
+                uplot.Series(label="s"),
+                uplot.Series(label="deg", stroke="rgb(38,108,190)", width=1.6, points={"show": False}),
+                hidden,
+                hidden,
+            ),
+            bands=(uplot.Band(series=(3, 2), fill="rgba(38,108,190,0.18)"),),
+            scales={"x": uplot.Scale(time=False, range=(-window, 0.0)), "y": uplot.Scale(auto=True)},
+            axes=(
+                uplot.Axis(size=20, label="s", labelSize=12, labelFont="10px sans-serif", labelGap=-2),
+                uplot.Axis(size=36, label="degrees", labelSize=14, labelFont="10px sans-serif"),
+            ),
+            legend=uplot.Legend(show=False),
+            height=HEIGHT,
+            padding=(4, 8, 0, 0),
+        )
+
+    def offer(self, names: tuple[str, ...], chosen: str) -> None:
+        """Offer these angles, and show one; hide the plot without one."""
+        self._names = {label_of(name): name for name in names} or {NONE: ""}
+        self._choice.options = tuple(self._names)
+        self._choice.visible = self._plot.visible = bool(chosen) or not names
+        if chosen:
+            self._choice.value = label_of(chosen)
+
+    def draw(self, history: AngleHistory) -> None:
+        """Show the chosen angle."""
+        curve = history.curve(self._names.get(self._choice.value, ""), POINTS)
+        if curve is not None:
+            self._plot.data = (curve.times, curve.values, curve.low, curve.high)
+            now = f"{curve.values[-1]:.1f}\u00b0"
+            known = np.isfinite(curve.latest_stddev)
+            self._choice.label = f"{now} \u00b1 {BAND * curve.latest_stddev:.1f}\u00b0" if known else f"{now} \u00b1 ?"

@@ -1,0 +1,109 @@
+"""The state of the graph in words, from the nodes' diagnostics: what plays, what records, how well it is calibrated."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+from body_tracking.messages.node_status import NodeStatus
+from body_tracking.viewing.status import FRESH
+
+PLAYER, RECORDER, CALIBRATION = "bag_player", "bag_recorder", "calibration"
+_RED, _GREEN, _ORANGE, _GREY = "#e03131", "#2f9e44", "#f08c00", "#868e96"
+_ENDED: Final = (
+    "The graph has ended; nothing here answers any more. Start it again, and this page comes back by itself: "
+    "<code>body_tracking up --viewer</code>, or with <code>--bag BAG</code> to play a recording."
+)
+
+
+def fresh(statuses: Mapping[str, NodeStatus], now: float) -> dict[str, NodeStatus]:
+    """The nodes that have reported of late."""
+    return {name: status for name, status in statuses.items() if now - status.received <= FRESH}
+
+
+def state_html(statuses: Mapping[str, NodeStatus], now: float, ended: bool = False) -> str:
+    """The state as HTML.
+
+    Args:
+        statuses: by node name.
+        now: steady time, seconds.
+        ended: the graph has ended.
+    """
+    there = {} if ended else fresh(statuses, now)
+    if ended or (statuses and not there):
+        return _block([_line(_RED, "ended", _ENDED)])
+    if not there:
+        return _block([_line(_ORANGE, "waiting", "no node has reported yet")])
+    lines = [*_input(there), _calibration(there), _recording(there)]
+    return _block([line for line in lines if line])
+
+
+def _input(there: Mapping[str, NodeStatus]) -> list[str]:
+    """The bag that plays, and the rate of each sensor."""
+    lines = []
+    if (player := there.get(PLAYER)) is not None:
+        bag = Path(player.values.get("bag", "")).name
+        position, duration = player.number("position s") or 0.0, player.number("duration s") or 0.0
+        again = ", again and again" if player.values.get("loop") == "True" else ""
+        playing = player.text == "playing"
+        words = f"<b>{html.escape(bag)}</b>, {position:.1f} of {duration:.1f} s{again}"
+        lines.append(_line(_GREEN if playing else _ORANGE, html.escape(player.text), words))
+    rates: dict[str, float] = {}
+    for status in there.values():
+        for key in status.values:
+            if key.startswith("rate in ") and key.endswith("/skeleton"):
+                sensor = key.removeprefix("rate in ").split("/")[-2]
+                rate = status.number(key) or 0.0
+                if sensor not in ("fused", "filtered"):
+                    rates[sensor] = max(rate, rates.get(sensor, 0.0))
+    if rates:
+        words = ", ".join(f"{html.escape(sensor)} {rate:.0f} Hz" for sensor, rate in sorted(rates.items()))
+        colour = _GREEN if all(rates.values()) else _ORANGE
+        lines.append(_line(colour, "sensors", words))
+    return lines
+
+
+def _calibration(there: Mapping[str, NodeStatus]) -> str:
+    """How well each sensor's pose is known, and what to do next."""
+    status = there.get(CALIBRATION)
+    if status is None:
+        return ""
+    known = []
+    for key in status.values:
+        if key.endswith(" rotation_stddev_deg"):
+            sensor = key.removesuffix(" rotation_stddev_deg")
+            degrees, millimetres = status.number(key), status.number(f"{sensor} translation_stddev_mm")
+            if degrees is not None and millimetres is not None:
+                known.append(f"{html.escape(sensor)} to {degrees:.1f}° and {millimetres:.0f} mm")
+    if status.text.startswith("waiting for a still pose"):
+        todo = "stand still for two seconds where all sensors see you, arms to the sides"
+    elif status.level:
+        todo = "walk about and turn where all sensors see you, until this is green"
+    elif known:
+        todo = "done; start again after a sensor has moved"
+    else:
+        return _line(_GREEN, "calibration", html.escape(status.text))
+    text = f"{html.escape(status.text)}{': ' if known else ''}{', '.join(known)} ({todo})"
+    return _line(_ORANGE if status.level else _GREEN, "calibration", text)
+
+
+def _recording(there: Mapping[str, NodeStatus]) -> str:
+    """Whether a recording runs, and the name of its folder."""
+    status = there.get(RECORDER)
+    if status is None:
+        return ""
+    folder, messages = status.values.get("bag", ""), status.number("messages") or 0.0
+    if status.text == "recording":
+        where = html.escape(folder) if folder not in ("", "None") else "a new folder"
+        return _line(_RED, "REC", f"<b>recording into {where}</b>, {messages:.0f} messages")
+    return _line(_RED if status.level == 2 else _GREY, "recording", html.escape(status.text))
+
+
+def _line(colour: str, what: str, text: str) -> str:
+    return f"<div><span style='color:{colour}'>&#9679; <b>{what}</b></span> {text}</div>"
+
+
+def _block(lines: list[str]) -> str:
+    return f"<div style='font-size:0.8em;line-height:1.35;padding:0.3em 0.6em'>{''.join(lines)}</div>"

@@ -1,0 +1,48 @@
+"""The state of the graph in words: what plays, what records, what to do for the calibration, and that it has ended."""
+
+from __future__ import annotations
+
+from body_tracking.messages.node_status import NodeStatus
+from body_tracking.viewing.state import state_html
+from body_tracking.viewing.status import FRESH
+
+PLAYER = {"bag": "/data/walk<1>", "position s": "3.21", "duration s": "20.0", "loop": "True"}
+KNOWN = {"kinect2 rotation_stddev_deg": "1.25", "kinect2 translation_stddev_mm": "8.4"}
+
+
+def said(node: str, text: str, values: dict[str, str], level: int = 0, now: float = 0.0) -> str:
+    return state_html({node: NodeStatus(f"{node}: stream", level, text, values)}, now)
+
+
+def test_it_says_which_bag_plays_and_where() -> None:
+    text = said("bag_player", "playing", PLAYER)
+    assert "walk&lt;1&gt;</b>, 3.2 of 20.0 s, again and again" in text
+    assert "paused" in said("bag_player", "paused", PLAYER)
+
+
+def test_a_recording_has_a_sign_and_the_name_of_its_folder() -> None:
+    text = said("bag_recorder", "recording", {"bag": "session", "messages": "120"})
+    assert "REC" in text and "recording into session</b>, 120 messages" in text
+    assert "REC" not in said("bag_recorder", "stopped", {"bag": "session", "messages": "120"})
+
+
+def test_the_calibration_says_how_well_and_what_to_do_next() -> None:
+    waiting = said("calibration", "waiting for a still pose seen by a and b", {}, level=1)
+    assert "stand still" in waiting
+    rough = said("calibration", "kinect2: roughly calibrated, walk about to refine", KNOWN, level=1)
+    assert "kinect2 to 1.2\u00b0 and 8 mm" in rough and "walk about and turn" in rough
+    assert "done" in said("calibration", "calibrated", KNOWN)
+
+
+def test_the_rate_of_each_sensor_is_there_but_of_no_estimate() -> None:
+    rates = {"rate in /lab/kinect1/skeleton": "29.6", "rate in /fused/skeleton": "30.0"}
+    text = said("fusion", "OK", rates)
+    assert "kinect1 30 Hz" in text and "fused" not in text
+
+
+def test_an_end_is_said_and_what_to_do_then() -> None:
+    running = {"fusion": NodeStatus("fusion: stream", 0, "OK", {}, 10.0)}
+    assert "has ended" not in state_html(running, 10.5)
+    assert "has ended" in state_html(running, 10.5, ended=True)
+    assert "body_tracking up --viewer" in state_html(running, 11.0 + FRESH)  # all nodes are silent
+    assert "no node has reported yet" in state_html({}, 0.0)
