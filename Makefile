@@ -10,6 +10,7 @@ MARKERS_BAG := bags/markers_arm
 DEMO_MARKERS := demo_markers_output
 MESH_BAG := bags/mesh_reaching
 DEMO_MESH := demo_mesh_output
+SITE_VENV := .site_venv
 CAMERA_BAG := bags/camera_reaching
 DEMO_CAMERA := demo_camera_output
 
@@ -32,7 +33,7 @@ export MPLBACKEND := Agg
 export PYTHONUNBUFFERED := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo demo-markers demo-mesh demo-camera test test-all lint ros2-workspace bench docs clean
+.PHONY: help setup demo demo-markers demo-mesh demo-camera test test-all lint ros2-workspace bench docs site clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z0-9-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 16
@@ -90,7 +91,7 @@ test: $(STAMP) ## formatting, lint, types and the tests, in five minutes
 	@$(call tests,not slow)
 
 test-all: export TEST_DRAWS = all
-test-all: $(STAMP) ## the same with the longer draws and recordings, in half an hour
+test-all: $(STAMP) $(SITE_VENV)/.installed ## the same with the longer draws and recordings, in half an hour
 	@$(call tests,slow or not slow)
 
 define tests
@@ -121,6 +122,16 @@ bench: $(STAMP) ## every benchmark that can run here; fails at the end where one
 docs: $(STAMP) ## rewrite what the code defines: tables of docs/reference.md, config/
 	$(BIN)/python docs/update.py
 
+# Of its own, since only who builds the site needs it.
+$(SITE_VENV)/.installed: docs/requirements.txt | $(STAMP)
+	@$(BIN)/python -m venv $(SITE_VENV)
+	@$(SITE_VENV)/bin/python -m pip install -qq --disable-pip-version-check -r docs/requirements.txt
+	@touch $@
+
+site: $(SITE_VENV)/.installed ## these pages as a site in build/site
+	@NO_MKDOCS_2_WARNING=1 $(SITE_VENV)/bin/mkdocs build --quiet --strict
+	@echo "site: build/site/index.html"
+
 clean: ## remove everything that make and colcon made
-	rm -rf $(VENV) $(DEMO) $(DEMO_MARKERS) $(DEMO_MESH) $(DEMO_CAMERA) .ros2_workspace build install log dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) $(SITE_VENV) $(DEMO) $(DEMO_MARKERS) $(DEMO_MESH) $(DEMO_CAMERA) .ros2_workspace build install log dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find . -name __pycache__ -not -path './.git/*' -prune -exec rm -rf {} +

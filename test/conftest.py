@@ -30,7 +30,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 PROCESSES = (
     *("nodes", "ros2", "test_cli.py", "test_docs.py", "test_fifth_system.py", "test_live_equals_offline.py"),
-    *("test_package.py", "test_up.py"),
+    *("test_examples.py", "test_package.py", "test_up.py"),
 )
 
 ONE_AT_A_TIME = {

@@ -32,7 +32,7 @@ class _Nobody:
 
 def command(*words: str | Path) -> str:
     """What a command of ours prints, with the system installed."""
-    path = os.pathsep.join([str(ROOT), str(ROOT / "test" / "fifth_system")])
+    path = os.pathsep.join([str(ROOT), str(ROOT / "examples" / "fifth_system")])
     environment = {**os.environ, "PYTHONPATH": path, "ROS_DOMAIN_ID": str(domain())}
     done = subprocess.run(
         [sys.executable, "-m", *map(str, words)], env=environment, capture_output=True, text=True, timeout=120
@@ -70,7 +70,7 @@ def test_its_topic_parameter_option_and_layer_are_among_the_graphs() -> None:
     assert "--height-margin METRES" in said
     assert "heights:" in command("body_tracking.nodes", "parameters")
     line = "from body_tracking import systems as s; print([t.name for t in s.TOPICS], [x.name for x in s.LAYERS])"
-    path = os.pathsep.join([str(ROOT), str(ROOT / "test" / "fifth_system")])
+    path = os.pathsep.join([str(ROOT), str(ROOT / "examples" / "fifth_system")])
     done = subprocess.run(
         [sys.executable, "-c", line], env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, check=True
     )
@@ -92,7 +92,7 @@ def test_a_broken_system_is_named_and_left_out(tmp_path: Path) -> None:
 
 def test_its_layer_is_drawn_and_can_be_switched_off(monkeypatch: pytest.MonkeyPatch) -> None:
     viser = pytest.importorskip("viser")
-    monkeypatch.syspath_prepend(str(ROOT / "test" / "fifth_system"))
+    monkeypatch.syspath_prepend(str(ROOT / "examples" / "fifth_system"))
     from heights.system import SYSTEM
 
     from body_tracking.viewing.page import Page

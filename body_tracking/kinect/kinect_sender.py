@@ -1,7 +1,7 @@
 """Streams the bodies that a Kinect v2 sees to another computer, where ``kinect_skeleton`` receives them.
 
 Runs on Windows without ROS and without this package: copy kinect_sender.py and kinect_protocol.py into one folder,
-install PyKinect2 (docs/sensors.md says which), and
+install PyKinect2 (docs/kinects.md says which), and
 
     python kinect_sender.py --make-key kinect.key
     python kinect_sender.py --sensor kinect1 --to 192.168.1.20:7525 --key-file kinect.key
@@ -74,7 +74,7 @@ class Kinect:
         except (ImportError, AssertionError, AttributeError, OSError) as error:
             raise SenderError(
                 f"PyKinect2 cannot be used here ({type(error).__name__}: {error}). It needs Windows, the Kinect for "
-                "Windows SDK 2.0 and PyKinect2 from its repository; see docs/sensors.md. --replay FILE needs none of it"
+                "Windows SDK 2.0 and PyKinect2 from its repository; see docs/kinects.md. --replay FILE needs none of it"
             ) from error
         self._sensor: Any = None
 

@@ -1,0 +1,28 @@
+"""The notebook in ``examples/``. README.md's test runs ``elbow.py``, ``test_fifth_system.py`` the system there."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.mark.slow
+def test_the_notebook_plots_a_recording(tmp_path: Path, wave: Path) -> None:
+    """Its cells, run one after the other as a program."""
+    notebook = json.loads((ROOT / "examples" / "angles.ipynb").read_text(encoding="utf-8"))
+    cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    (tmp_path / "notebook.py").write_text("\n".join([*cells, "figure.savefig('angles.png')"]), encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"}
+    replay = (sys.executable, "-m", "body_tracking.cli", "replay", str(wave), "-o", "angles", "--filter", "ekf")
+    for command in (replay, (sys.executable, "notebook.py")):
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr
+    assert "elbow_flexion_left_body1" in done.stdout
+    assert (tmp_path / "angles.png").stat().st_size > 10_000
