@@ -33,6 +33,7 @@ from body_tracking.recording import forked
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader
+from body_tracking.recording.summary import summary
 from body_tracking.systems import (
     OPTIONS,
     STAGES,
@@ -354,6 +355,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     command.add_argument("--overwrite", action="store_true", help="replace an existing OUT")
     command.add_argument("--json", action="store_true", help="print the report as JSON")
+    command.add_argument("-v", "--verbose", action="store_true", help="also print what was left out or noted")
     command.set_defaults(run=run)
 
 
@@ -368,6 +370,11 @@ def run(args: argparse.Namespace) -> int:
         f"{report.frames} frames of joint angles from {report.recording_s:.1f} s of recording in "
         f"{report.elapsed_s:.1f} s ({report.recording_s / max(report.elapsed_s, 1e-9):.0f} times real time)"
     )
-    print(f"left out or noted on the way: {_listed(report.counters)}")
+    for line in summary(args.output):
+        print(line)
+    if args.verbose:
+        print(f"left out or noted on the way: {_listed(report.counters)}")
+    elif report.counters:
+        print(f"{len(report.counters)} counters of what was left out or noted on the way: -v prints them")
     print(f"written to {args.output}")
     return 0

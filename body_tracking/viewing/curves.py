@@ -11,6 +11,7 @@ import numpy as np
 
 from body_tracking.core.clocks import jumped_back
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
+from body_tracking.kinematics.labels import UNKNOWN
 
 BAND: Final = 1.959963984540054
 """Half width of the 95 % band of a normal distribution, in standard deviations."""
@@ -77,11 +78,11 @@ class AngleHistory:
             self._rows.popleft()
 
     def known(self) -> tuple[str, ...]:
-        """The angles that have a value and a finite standard deviation at any time that is shown."""
+        """The angles that had a value with a standard deviation below ``UNKNOWN`` at any time that is shown."""
         if not self._rows:
             return ()
         rows = np.array([row for _, row in list(self._rows)])
-        seen: BoolArray = np.isfinite(rows).all(axis=1).any(axis=0)
+        seen: BoolArray = (np.isfinite(rows[:, 0]) & (rows[:, 1] < UNKNOWN)).any(axis=0)
         return tuple(name for name, there in zip(self.names, seen, strict=True) if there)
 
     def curve(self, name: str, count: int) -> Curve | None:

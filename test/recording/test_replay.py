@@ -7,6 +7,7 @@ import gc
 import json
 import multiprocessing
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -39,6 +40,7 @@ from body_tracking.recording.forked import Downstream, ForkedDownstream
 from body_tracking.recording.replay import ReplayError, ReplaySettings, replay
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BagError, BagReader, BagWriter, RawMessage, deserialize
+from body_tracking.recording.summary import summary
 from body_tracking.simulation.bags import write_bag
 from body_tracking.simulation.scene import Setup, simulate
 from draws import some
@@ -306,6 +308,20 @@ def test_the_command_prints_a_report(wave: Path, tmp_path: Path, command: Comman
     assert report["frames"] > 0.9 * reference_frames(wave)
     assert report["recording_s"] == pytest.approx(seconds(wave), abs=0.1)
     assert 0.0 < report["elapsed_s"] < 60.0
+
+
+def test_the_summary_of_a_replay_has_poses_and_known_angles(replayed_wave: Path, extended_wave: Path) -> None:
+    lines = list(summary(replayed_wave))
+    assert lines[0].startswith("kinect1: at x 0.00, y 0.00, z 0.00 m of world, looks 0 deg")
+    assert [line.partition(":")[0] for line in lines[1:]] == [
+        "kinect2",
+        *(f"body1, {limb}" for limb in ("left arm", "right arm", "trunk and head")),
+    ]
+    assert all(
+        re.search(r"[1-9] of \d angles known, in \d+ % of the frames, with a standard", line) for line in lines[2:]
+    )
+    # the prior's deviation is no knowledge
+    assert any("; not left" in line for line in summary(extended_wave))
 
 
 def test_calibrate_prints_poses_and_clocks(wave: Path, tmp_path: Path, command: Command) -> None:

@@ -116,7 +116,7 @@ def test_elbows_come_first_where_there_are_any() -> None:
 def test_only_angles_with_a_value_and_a_finite_deviation_are_known() -> None:
     history = AngleHistory(10.0)
     assert history.known() == ()
-    history.add(0, ("a", "b", "c"), np.array([0.1, np.nan, 0.2]), np.array([0.1, 0.1, np.inf]))
+    history.add(0, ("a", "b", "c"), np.array([0.1, np.nan, 0.2]), np.array([0.1, 0.1, 0.6]))
     assert history.known() == ("a",)
     history.add(STEP_NS, ("a", "b", "c"), np.array([np.nan, 0.1, 0.2]), np.array([0.1, 0.1, np.inf]))
     assert history.known() == ("a", "b")

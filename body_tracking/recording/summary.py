@@ -1,0 +1,83 @@
+"""What matters of a bag with joint angles: the poses of the sensors, and which angles are known, and how well."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from body_tracking.core.sensor_poses import SensorPose
+from body_tracking.kinematics.labels import UNKNOWN, by_limb, label_of
+from body_tracking.messages.angles import joint_state_values
+from body_tracking.messages.calibration import transform_to_pose
+from body_tracking.pipeline import graph
+from body_tracking.recording.rosbag2 import BagReader, deserialize
+
+_READ: Final = 1000
+"""Messages of a person that are read at most, evenly over the bag."""
+
+
+def summary(path: Path) -> Iterator[str]:
+    """A line for each sensor with a pose, and for each limb of each person with angles.
+
+    Args:
+        path: a bag that the graph has written.
+
+    Raises:
+        BagError: the bag cannot be read.
+        MessageError: a malformed message.
+    """
+    with BagReader(path) as bag:
+        yield from _poses(bag)
+        for body in graph.bodies_among(bag.topics):
+            yield from _angles(bag, body)
+
+
+def _poses(bag: BagReader) -> Iterator[str]:
+    if graph.CALIBRATION not in bag.topics:
+        return
+    kind = bag.topics[graph.CALIBRATION].type_name
+    poses: dict[str, SensorPose] = {}
+    for raw in bag.messages([graph.CALIBRATION]):
+        pose = transform_to_pose(deserialize(kind, raw.cdr))
+        poses[pose.sensor] = pose
+    for sensor, pose in sorted(poses.items()):
+        x, y, z = pose.translation
+        ahead = pose.rotation[:, 2]
+        heading, down = 0.0 + np.round(
+            np.degrees([np.arctan2(ahead[1], ahead[0]), np.arcsin(np.clip(-ahead[2], -1.0, 1.0))])
+        )
+        yield (
+            f"{sensor}: at x {x:.2f}, y {y:.2f}, z {z:.2f} m of world, looks {heading:.0f} deg to the left of x and "
+            f"{down:.0f} deg down"
+        )
+
+
+def _angles(bag: BagReader, body: str) -> Iterator[str]:
+    topic = graph.joint_states_stddev_topic(body)
+    if topic not in bag.topics or not (count := bag.topics[topic].count):
+        return
+    kind, step = bag.topics[topic].type_name, max(1, count // _READ)
+    found: dict[str, list[float]] = {}
+    for number, raw in enumerate(bag.messages([topic])):
+        if number % step == 0:
+            _, names, stddevs = joint_state_values(deserialize(kind, raw.cdr))
+            for name, stddev in zip(names, np.degrees(stddevs), strict=True):
+                found.setdefault(name.removesuffix(f"_{body}"), []).append(float(stddev))
+    for limb, names_of_limb in by_limb(found).items():
+        medians, shares, unknown = [], [], []
+        for name in names_of_limb:
+            stddevs = np.array(found[name])
+            known = stddevs[stddevs < UNKNOWN]  # not NaN or infinity
+            if 2 * len(known) < len(stddevs):
+                unknown.append(label_of(name))
+            else:
+                medians.append(float(np.median(known)))
+                shares.append(100.0 * len(known) / len(stddevs))
+        text = f"{body}, {limb}: {len(medians)} of {len(names_of_limb)} angles known"
+        if medians:
+            size = " to ".join(dict.fromkeys((f"{min(medians):.1f}", f"{max(medians):.1f}")))
+            text += f", in {np.mean(shares):.0f} % of the frames, with a standard deviation of {size} deg"
+        yield text + (f"; not {', '.join(unknown)}" if unknown else "")
