@@ -312,8 +312,10 @@ def resident(running: Running) -> dict[str, int]:
     return {name: psutil.Process(process.pid).memory_info().rss for name, process in running.processes.items()}
 
 
-GROWTH = {"bag_recorder": 0.15}
-"""Of memory, where more than 0.05: queues of 1000 messages keep the largest that each place ever had."""
+GROWTH = {"bag_recorder": 0.15, "viewer": 0.08}
+"""Of memory, where more than 0.05: queues of 1000 messages keep the largest that each place ever had. The viewer, which is
+a third of the way when it is first measured, levels off: with its topics alone 245 MB after 80,000 messages, 249 after
+160,000, 252 after 320,000."""
 
 
 @pytest.mark.parametrize("seed", [1])
