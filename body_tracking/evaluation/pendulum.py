@@ -32,6 +32,8 @@ _LEAST: Final = 20
 """Least number of samples."""
 _ROUNDS: Final = 5
 """Fits of the arc, each without the outliers of the one before."""
+_FAR: Final = 3.0
+"""Median distances from the middle within which points tell the direction of a swing, whose ends are 1.4 away."""
 _OUTLIER: Final = 4.0
 """Standard deviations from which on a point is no point of the arc."""
 _NORMAL_MAD: Final = 1.4826
@@ -173,7 +175,9 @@ def along(points: FloatArray) -> FloatArray:
     if not known.any():
         return np.full(points.shape, np.nan)
     centred = points - np.median(points[known], axis=0)
-    _, vectors = np.linalg.eigh(centred[known].T @ centred[known])
+    distances = np.linalg.norm(centred, axis=1)
+    near = distances <= _FAR * np.median(distances[known])  # false for NaN
+    _, vectors = np.linalg.eigh(centred[near].T @ centred[near])
     return np.asarray(centred @ vectors[:, ::-1])
 
 
@@ -188,7 +192,10 @@ def sines(points: FloatArray) -> FloatArray:
     """
     u, v = along(points).T
     known = np.isfinite(u)
-    inside, curvature = known.copy(), 0.0
+    # one far from the others would bend the first arc
+    near = known & (np.abs(u) <= _FAR * np.median(np.abs(u[known])))
+    off = np.abs(v - np.median(v[known]))
+    inside, curvature = near & (off <= _OUTLIER * _NORMAL_MAD * np.median(off[known])), 0.0
     for _ in range(_ROUNDS):
         # the arc over c: (1 - sqrt(1 - c^2 u^2)) / c = c u^2 / (1 + sqrt(1 - c^2 u^2))
         rise = u**2 / (1.0 + np.sqrt(np.maximum(1.0 - (curvature * u) ** 2, 0.0)))
@@ -196,7 +203,7 @@ def sines(points: FloatArray) -> FloatArray:
         line = np.linalg.lstsq(design[inside], v[inside], rcond=None)[0]
         curvature = abs(float(line[2]))
         residual = np.abs(design @ line - v)
-        inside = known & (residual <= _OUTLIER * _NORMAL_MAD * np.median(residual[known]))
+        inside = near & (residual <= _OUTLIER * _NORMAL_MAD * np.median(residual[near]))
     return np.asarray(curvature * u)
 
 
