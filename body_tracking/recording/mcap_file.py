@@ -109,7 +109,8 @@ def _chunk_records(content: bytes, cut: bool) -> bytes:
     data = _decompress(chunk.compression, chunk.data, size + 1)  # one byte more, to detect a wrong size
     if not cut and len(data) != size:
         raise Damaged("its size does not fit")
-    if not cut and chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
+    # a chunk whose length is damaged seems to be cut, and may be whole
+    if len(data) == size and chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
         raise Damaged("its checksum does not fit")
     return data
 
