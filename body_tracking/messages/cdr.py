@@ -112,7 +112,7 @@ def encode_skeletons(skeletons: tuple[Skeleton, ...] | list[Skeleton]) -> bytes:
             row[:, 4:10] = skeleton.covariances.reshape(N_JOINTS, 9)[:, _UPPER_OF_NINE]
         if skeleton.velocities is not None:
             row[:, -3:] = skeleton.velocities
-    dense = b"\x01" if np.isfinite(first.positions).all() else b"\x00"
+    dense = b"\x01" if all(np.isfinite(each.positions).all() for each in skeletons) else b"\x00"
     return _header(first.stamp_ns, first.frame_id) + layout.table + points.tobytes() + dense
 
 
