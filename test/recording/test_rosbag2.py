@@ -356,7 +356,7 @@ def test_flipped_bits_never_bring_up_a_message_that_was_not_written(tmp_path, co
     path = tmp_path / "flipped.mcap"
     generator = random.Random(20)
     whole = 0
-    count = draws(100, 250)
+    count = draws(180, 250)
     for _ in range(count):
         broken = bytearray(data)
         for _ in range(generator.choice([1, 1, 2, 5])):
