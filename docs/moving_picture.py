@@ -28,12 +28,15 @@ BAG = ROOT / "bags" / "tpose_wave"
 SIZE = (1280, 720)
 WIDTH = 800
 """Pixels of the picture."""
-RATE = 0.2
+RATE = 0.1
 FIRST_S, LAST_S = 4.0, 12.0
 """Of the recording: from the T-pose into the wave."""
 LARGEST = 1_500_000
 """Bytes that README.md's picture may have."""
-COMMAND = (sys.executable, "-m", "body_tracking.cli", "up", "--bag", str(BAG), "--filter", "ekf", "--rate", str(RATE))
+COMMAND = (
+    *(sys.executable, "-m", "body_tracking.cli", "up", "--bag", str(BAG), "--rate", str(RATE)),
+    *("--filter", "ekf", "--convention", "isb"),
+)
 
 
 def address(file: Path, patience: float = 60.0) -> str:
@@ -63,6 +66,7 @@ def pictures(url: str) -> list[tuple[float, Image.Image]]:
         page.wait_for_timeout(1e3 * FIRST_S / RATE)
         for note in page.locator(".mantine-Notification-closeButton").all():
             note.dispatch_event("click")
+        page.wait_for_timeout(3e3)
         start = time.monotonic()
         while (now := (time.monotonic() - start) * RATE) < LAST_S - FIRST_S:
             image = Image.open(io.BytesIO(page.screenshot(timeout=60e3))).convert("RGB")

@@ -105,8 +105,10 @@ def moved(q: Array, name: str, convention: str, by: float) -> Array:
     kept = np.isfinite(want)
     want[names.index(name)] += by
     weights = np.where(np.array(names) == name, 10.0, 1.0)[kept]
-    if name.startswith("trunk"):  # of ``model``: sums of two joints of the spine, which are angles, too
-        weights[[n.startswith(("lumbar", "thoracic")) for n in np.array(names)[kept]]] = 0.0
+    if convention == "model":  # whose angles of the trunk are sums of the spine's two joints
+        sums = np.array([n.startswith("trunk") for n in names])[kept]
+        parts = np.array([n.startswith(("lumbar", "thoracic")) for n in names])[kept]
+        weights[parts if name.startswith("trunk") else sums] = 0.0
     for _ in range(15):
         error = (want - angles(q, convention))[kept]
         error = (error + np.pi) % (2 * np.pi) - np.pi
