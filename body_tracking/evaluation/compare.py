@@ -16,6 +16,7 @@ import numpy as np
 from body_tracking.core import files
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.evaluation.estimated_segments import EstimatedSegments, read_segments, read_true_segments
+from body_tracking.evaluation.hand_eye import MAX_GAP
 from body_tracking.evaluation.marker_reference import MarkerReference, has_targets, read_marker_reference
 from body_tracking.evaluation.mutual_comparison import USABLE, compare_estimates
 from body_tracking.evaluation.reading import EvaluationError
@@ -88,8 +89,10 @@ def known_shares(side: Side, seconds: float) -> dict[str, float]:
     """By angle the share of so many seconds in which the system states it to :data:`USABLE`; empty for targets."""
     if isinstance(side, MarkerReference):
         return {}
-    angles, step = side.angles, float(np.median(np.diff(side.angles.stamps_ns))) / NANOSECONDS
-    shares = np.minimum((angles.stddev < USABLE).sum(axis=0) * step / seconds, 1.0)
+    angles = side.angles
+    # until the next frame, which a system that has lost the person does not have for long
+    steps = np.minimum(np.diff(angles.stamps_ns) / NANOSECONDS, MAX_GAP)
+    shares = np.minimum(steps @ (angles.stddev[:-1] < USABLE) / seconds, 1.0)
     return dict(zip(angles.names, shares.tolist(), strict=True))
 
 

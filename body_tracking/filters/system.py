@@ -33,8 +33,11 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
         return
     imus = options["imus"]
     worn = graph.imu_topics(imus if isinstance(imus, tuple) else ())
-    # those of the arms are in the mesh of a depth camera already, and would count twice
-    segments = tuple(each.segment for each in worn if not (options["depth"] and each.segment in graph.ARM_SEGMENTS))
+    # Those of the arms are in the mesh of a depth camera already, and count twice; but no mesh shows how an arm is
+    # turned about itself, and beside other sensors that is worth more (docs/five_systems.md).
+    depth, sensors = options["depth"], options["sensors"]
+    meshes_alone = isinstance(depth, tuple) and isinstance(sensors, tuple) and len(depth) == len(sensors) > 0
+    segments = tuple(each.segment for each in worn if not (meshes_alone and each.segment in graph.ARM_SEGMENTS))
     defaults: dict[str, Value] = {"orientations": segments} if segments else {}
     if options["computed"]:
         defaults["not_kinects"] = options["computed"]
