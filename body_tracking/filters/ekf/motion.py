@@ -14,9 +14,6 @@ from body_tracking.filters.ekf.sources import PER_SOURCE, advance
 from body_tracking.filters.ekf.state import State, StateSpace
 
 _SIDES, _ARM = ("left", "right"), ("shoulder", "elbow", "forearm", "wrist")
-_SLOW_TIME_BESIDE = 30.0
-"""Seconds for which slow errors of cameras persist beside orientations: where a camera takes a joint to be never
-changes, and over a shorter time it would be learnt as a pose, against what orientations say."""
 _OF_SPEED = 16.0
 """1/s: with orientations, additional density of a joint's acceleration per square of its speed. A limb swung twice a
 second has 4 pi times its speed as acceleration for about a tenth of a second; with too small a density the lag would be
@@ -83,7 +80,7 @@ class Motion:
             self._balls,
             reach,
             fade,
-            math.exp(-dt / self._slow_time(state)),
+            math.exp(-dt / self._parameters.slow_time),
             np.array([[tt], [vv], [tv]]) * density,
         )
         sources = state.sources
@@ -118,10 +115,6 @@ class Motion:
     def _turns(self, step: FloatArray) -> FloatArray:
         """(3, 3, 3) rotations of the free rotations' tangents by a step (32,)."""
         return so3.quat_to_matrix(so3.exp(-step[self._model.ball_v]))
-
-    def _slow_time(self, state: State) -> float:
-        """Seconds for which slow errors of cameras persist."""
-        return _SLOW_TIME_BESIDE if state.sources.names else self._parameters.slow_time
 
     def _densities(self) -> tuple[FloatArray, FloatArray]:
         """(32, 32) which coordinates are of the same joint, and (32,) the density of each."""
