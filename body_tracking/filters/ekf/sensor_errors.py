@@ -39,8 +39,6 @@ _ALONE = 0.1
 """Share of the parameter ``slow_scale`` for a sensor that no other one contradicts: with all of it the population's
 segment lengths outweigh the person's in the first seconds, and elbows err by 10 instead of 6 degrees
 (``benchmarks/kinect_vs_vicon.py``)."""
-_SLOW_BOUND = 25.0
-_MEDIAN_OF_CHI2 = 0.455
 _LEAST_ERROR = 0.004
 """Metres: no sensor knows where the centre of a joint is better than this."""
 _SIGNIFICANT = 2.0
@@ -153,12 +151,7 @@ class SensorErrors:
             return _kept(sensor.slow, max(sensor.slow, least)), sensor.slow_estimate, sensor.slow_information
         half = whitening * np.sqrt(measurement.model_variance).repeat(3)[rows]
         gram = half.T @ half
-        expected = gram.diagonal()
-        squares = (white @ half) ** 2
-        # one that is far from all others says nothing, where all are far they say much
-        shares = np.sort(squares / np.maximum(expected, 1e-30))
-        usual = max(1.0, float(shares[len(rows) // 2]) / _MEDIAN_OF_CHI2)
-        score = 0.5 * float((np.minimum(squares, _SLOW_BOUND * usual * expected) - expected).sum())
+        score = 0.5 * float(((white @ half) ** 2 - gram.diagonal()).sum())
         information = 0.5 * float((gram * gram).sum())
         passed = _SLOW_PERIOD_NS / NANOSECONDS
         total = sensor.slow_information * math.exp(-passed / _SLOW_MEMORY) + information
