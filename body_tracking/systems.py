@@ -299,15 +299,17 @@ CONFIG_HEADER = """\
 #   body_tracking up --params-file my_parameters.yaml
 #   ros2 launch body_tracking two_kinects.launch.py params_file:=my_parameters.yaml
 # The command line, not the file, sets what connects the graph: names of sensors, the bag, simulated time.
-# A section /** applies to all nodes that have the parameter.
+# A section /** applies to all nodes that have the parameter. A first session may need those under "basic"; the defaults
+# of those under "advanced" fit nearly always.
 """
 
 
 def config_text() -> str:
     """``config/body_tracking.yaml``; needs ROS to import the nodes."""
     settable = [option.parameter for option in OPTIONS.values() if option.parameter is not None]
-    sections = {}
+    sections, basic = {}, {}
     for spec in sorted(all_nodes_for(options_of()), key=lambda spec: EXECUTABLES.index(spec.executable)):
         hidden = spec.parameters.keys() - {parameter for node, parameter in settable if node == spec.name}
         sections[spec.name] = [item for item in parameters_of(spec.executable) if item.name not in hidden]
-    return f"{CONFIG_HEADER}\n{as_yaml(sections)}"
+        basic[spec.name] = NODES[spec.executable].basic
+    return f"{CONFIG_HEADER}\n{as_yaml(sections, basic)}"

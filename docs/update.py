@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from body_tracking import cli, systems
-from body_tracking.core.parameters import Parameter, Value
+from body_tracking.core.parameters import Parameter, Value, grouped
 from body_tracking.core.qos import Qos
 from body_tracking.kinect import simulated as kinect
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
@@ -150,7 +150,10 @@ def parameters() -> str:
     rows = [(*_row(item), ", ".join(nodes)) for item, nodes in common.items()]
     parts = ["### Several nodes\n\n" + table((*titles, "nodes"), rows)]
     for executable, items in of_node.items():
-        own = table(titles, [_row(item) for item in items if item not in common])
+        basic, advanced = grouped(items, systems.NODES[executable].basic)
+        own = table(titles, [_row(item) for item in (*basic, *advanced) if item not in common])
+        if basic:
+            own += f"\nBasic: {', '.join(f'`{item.name}`' for item in basic)}; all others are advanced.\n"
         shared = ", ".join(f"`{item.name}`" for item in items if item in common)
         more = f"\nAlso, as in [several nodes](#several-nodes): {shared}.\n" if shared else ""
         parts.append(f"### {executable}\n\n{own}{more}")

@@ -21,6 +21,7 @@ from body_tracking.core.parameters import (
     read_file,
     to_ros,
 )
+from body_tracking.systems import NODES, parameters_of
 
 TABLE = (
     Parameter("gain", 1.0, "how much", unit="m", min=0.0, max=2.0),
@@ -141,3 +142,14 @@ def test_invalid_file_is_refused(tmp_path: Path, content: str) -> None:
 )
 def test_sections_match_nodes_as_in_ros(pattern: str, node: str, match: bool) -> None:
     assert matches(pattern, node) is match
+
+
+def test_basic_parameters_come_first_and_are_some_of_the_nodes(tmp_path: Path) -> None:
+    text = as_yaml({"node": TABLE}, {"node": [TABLE[-1].name]})
+    assert text.index("# --- basic") < text.index(f"{TABLE[-1].name}:") < text.index("# --- advanced")
+    file = tmp_path / "parameters.yaml"
+    file.write_text(text)
+    assert set(read_file(file)["/node"]) == {each.name for each in TABLE}
+    for node in NODES.values():
+        if node.stage:
+            assert set(node.basic) <= {each.name for each in parameters_of(node.name)}

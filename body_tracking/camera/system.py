@@ -96,8 +96,15 @@ SYSTEM = System(
     "camera",
     order=1,
     nodes=(
-        NodeType("camera_skeleton", Place.IMAGES, "body_tracking.camera.stage:CameraStage"),
-        NodeType("camera_rig", Place.IMAGES, "body_tracking.camera.rig_stage:RigStage"),
+        NodeType(
+            "camera_skeleton",
+            Place.IMAGES,
+            "body_tracking.camera.stage:CameraStage",
+            basic=("driver", "model", "people"),
+        ),
+        NodeType(
+            "camera_rig", Place.IMAGES, "body_tracking.camera.rig_stage:RigStage", basic=("driver", "model", "people")
+        ),
     ),
     specs=_specs,
     played=_played,

@@ -257,19 +257,39 @@ def _flatten(values: Mapping[object, object], prefix: str, flat: dict[str, objec
             flat[f"{prefix}{key}"] = value
 
 
-def as_yaml(sections: Mapping[str, Sequence[Parameter]]) -> str:
-    """A commented parameters file with every parameter of each node at its default."""
+def as_yaml(
+    sections: Mapping[str, Sequence[Parameter]], basic: Mapping[str, Collection[str]] = MappingProxyType({})
+) -> str:
+    """A commented parameters file with every parameter of each node at its default.
+
+    Args:
+        sections: by node.
+        basic: by node the names of the parameters that come first, in a group of their own.
+    """
     lines: list[str] = []
     for node, table in sections.items():
         lines += ["", f"{node}:", f"  {SECTION}:"]
-        for parameter in table:
-            notes = [part for part in (parameter.unit, parameter.constraint) if part]
-            notes += ["may change while running"] if parameter.live else []
-            text = parameter.doc + (f" ({'; '.join(notes)})" if notes else "")
-            lines += textwrap.wrap(text, 112, initial_indent="    # ", subsequent_indent="    # ")
-            value = yaml.safe_dump(to_ros(parameter.default), default_flow_style=True).splitlines()[0]
-            lines.append(f"    {parameter.name}: {value}")
+        first, rest = grouped(table, basic.get(node, ()))
+        for title, group in (("basic", first), ("advanced", rest)):
+            if first and group:
+                lines.append(f"    # --- {title}")
+            for parameter in group:
+                lines += _commented(parameter)
     return "\n".join(lines[1:]) + "\n"
+
+
+def grouped(table: Sequence[Parameter], basic: Collection[str]) -> tuple[list[Parameter], list[Parameter]]:
+    """The parameters of these names, and all others, each in their order."""
+    return [each for each in table if each.name in basic], [each for each in table if each.name not in basic]
+
+
+def _commented(parameter: Parameter) -> list[str]:
+    notes = [part for part in (parameter.unit, parameter.constraint) if part]
+    notes += ["may change while running"] if parameter.live else []
+    text = parameter.doc + (f" ({'; '.join(notes)})" if notes else "")
+    value = yaml.safe_dump(to_ros(parameter.default), default_flow_style=True).splitlines()[0]
+    lines = textwrap.wrap(text, 112, initial_indent="    # ", subsequent_indent="    # ")
+    return [*lines, f"    {parameter.name}: {value}"]
 
 
 def matches(pattern: str, node: str) -> bool:

@@ -55,7 +55,14 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
 SYSTEM = System(
     "filters",
     order=2,
-    nodes=(NodeType("skeleton_filter", Place.FILTER, "body_tracking.filters.stage:FilterStage"),),
+    nodes=(
+        NodeType(
+            "skeleton_filter",
+            Place.FILTER,
+            "body_tracking.filters.stage:FilterStage",
+            basic=("filter", "subject", "people"),
+        ),
+    ),
     specs=_specs,
     options=(
         Option(

@@ -45,7 +45,14 @@ def _finds(topics: Mapping[str, str]) -> dict[str, Value]:
 SYSTEM = System(
     "inertial",
     order=1,
-    nodes=(NodeType("imu_skeleton", Place.SENSING, "body_tracking.inertial.stage:ImuStage"),),
+    nodes=(
+        NodeType(
+            "imu_skeleton",
+            Place.SENSING,
+            "body_tracking.inertial.stage:ImuStage",
+            basic=("segments", "mountings", "pose", "stature"),
+        ),
+    ),
     specs=_specs,
     played=_played,
     finds=_finds,

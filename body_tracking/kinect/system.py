@@ -119,10 +119,17 @@ SYSTEM = System(
     "kinect",
     order=0,
     nodes=(
-        NodeType("kinect_skeleton", Place.SOURCE),
-        NodeType("skeleton_adapter", Place.SOURCE),
-        NodeType("calibration", Place.CALIBRATION, "body_tracking.calibration.stage:CalibrationStage"),
-        NodeType("fusion", Place.FUSION, "body_tracking.fusion.stage:FusionStage"),
+        NodeType("kinect_skeleton", Place.SOURCE, basic=("backend", "file", "address", "port", "key_file")),
+        NodeType("skeleton_adapter", Place.SOURCE, basic=("sensor", "topic")),
+        NodeType(
+            "calibration",
+            Place.CALIBRATION,
+            "body_tracking.calibration.stage:CalibrationStage",
+            basic=("reference", "calibration_file", "reference_height"),
+        ),
+        NodeType(
+            "fusion", Place.FUSION, "body_tracking.fusion.stage:FusionStage", basic=("reference", "subject", "people")
+        ),
     ),
     specs=_specs,
     played=_played,

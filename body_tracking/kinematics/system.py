@@ -43,7 +43,14 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
 SYSTEM = System(
     "kinematics",
     order=3,
-    nodes=(NodeType("joint_angles", Place.ANGLES, "body_tracking.kinematics.stage:AnglesStage"),),
+    nodes=(
+        NodeType(
+            "joint_angles",
+            Place.ANGLES,
+            "body_tracking.kinematics.stage:AnglesStage",
+            basic=("convention", "subject", "people"),
+        ),
+    ),
     specs=_specs,
     options=(
         Option(

@@ -73,7 +73,7 @@ def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
 SYSTEM = System(
     "mesh",
     order=1,
-    nodes=(NodeType("mesh_tracker", Place.IMAGES, "body_tracking.mesh.stage:MeshStage"),),
+    nodes=(NodeType("mesh_tracker", Place.IMAGES, "body_tracking.mesh.stage:MeshStage", basic=("person",)),),
     specs=_specs,
     played=_played,
     finds=_finds,

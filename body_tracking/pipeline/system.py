@@ -105,6 +105,7 @@ class NodeType:
         name: ``ros2 run body_tracking <name>``.
         place: between the sensors and the angles.
         stage: ``module:Class`` of the stage that it hosts; empty for a node in ``body_tracking.nodes.<name>``.
+        basic: names of the parameters that a first session may need; the defaults of all others fit nearly always.
         takes: of a node without a stage: returns its input topics, given its parameters and all topics of the graph.
     """
 
@@ -112,6 +113,7 @@ class NodeType:
     place: Place
     stage: str = ""
     takes: Callable[[Mapping[str, Value], Iterable[str]], Iterable[str]] | None = None
+    basic: tuple[str, ...] = ()
 
     @property
     def module(self) -> str:

@@ -55,7 +55,10 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
 SYSTEM = System(
     "recording",
     order=5,
-    nodes=(NodeType("bag_player", Place.SOURCE), NodeType("bag_recorder", Place.RECORDER, takes=_recorded)),
+    nodes=(
+        NodeType("bag_player", Place.SOURCE, basic=("bag", "rate", "loop", "start_offset", "topics")),
+        NodeType("bag_recorder", Place.RECORDER, takes=_recorded, basic=("folder", "topics", "exclude")),
+    ),
     specs=_specs,
     options=(
         Option("bag", "", "play this bag instead of the sensors", "BAG", path=True),

@@ -57,7 +57,7 @@ def convention_of(mapping: Path, asked: str) -> str:
 SYSTEM = System(
     "robot",
     order=4,
-    nodes=(NodeType("robot_commands", Place.CONSUMER, takes=_takes),),
+    nodes=(NodeType("robot_commands", Place.CONSUMER, takes=_takes, basic=("mapping", "rate")),),
     specs=_specs,
     options=(
         Option(

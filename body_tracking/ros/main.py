@@ -94,11 +94,14 @@ class _SignalHandler:
 
 def usage(node_class: type[GraphNode]) -> str:
     """The text of ``--help``."""
+    from body_tracking.systems import NODES  # not before every start
+
     name = node_class.NAME
+    basic = NODES[name].basic if name in NODES else ()
     return (
         f"usage: ros2 run body_tracking {name} [--ros-args [-p PARAMETER:=VALUE ...] [--params-file FILE]]\n\n"
         f"{inspect.getdoc(node_class)}\n\nIts parameters with their defaults, as a parameters file:\n\n"
-        f"{as_yaml({name: node_class.PARAMETERS})}"
+        f"{as_yaml({name: node_class.PARAMETERS}, {name: basic})}"
     ).rstrip()
 
 

@@ -28,7 +28,7 @@ SYSTEM = System(
     order=6,
     nodes=(
         NodeType("body_markers", Place.CONSUMER, takes=_skeletons),
-        NodeType("viewer", Place.CONSUMER, takes=_skeletons),
+        NodeType("viewer", Place.CONSUMER, takes=_skeletons, basic=("host", "port", "window")),
     ),
     specs=_specs,
     options=(
