@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 
-from body_tracking.core.body_model import SEGMENTS
 from body_tracking.core.message_types import IMU, POINT_CLOUD
 from body_tracking.core.parameters import Value
 from body_tracking.pipeline import graph
@@ -37,6 +36,8 @@ def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
 
 def _finds(topics: Mapping[str, str]) -> dict[str, Value]:
     """Sensors that publish under the names of segments."""
+    from body_tracking.core.body_model import SEGMENTS  # imports numpy, which --help does without
+
     there = {topic for topic, kind in topics.items() if kind == IMU}
     worn = tuple(each for each in SEGMENTS if there.intersection(graph.imu_topics([each])[0].imu))
     return {"imus": worn} if worn else {}
