@@ -39,13 +39,11 @@ class Pair:
         angles: by name, of those that both know.
         measured: RMS difference of all of these.
         covered: share of all within 1.96 of the deviations that both state.
-        notes: a line each.
     """
 
     angles: Mapping[str, Judged]
     measured: float
     covered: float
-    notes: tuple[str, ...]
 
 
 def read_side(path: Path) -> Side:
@@ -73,7 +71,7 @@ def compare_pair(one: Side, other: Side) -> Pair:
         raise EvaluationError(f"{one.source} and {other.source}: both are of the marker system")
     if isinstance(other, MarkerReference):
         judged = evaluate_by_markers(one, other, one_clock=True)
-        rows, notes = judged.angles, judged.notes
+        rows = judged.angles
         count = np.array([row.samples for row in rows], dtype=np.float64)
         if not count.sum():
             raise EvaluationError(f"{one.source} and {other.source}: the targets determine no angle that both know")
@@ -81,8 +79,8 @@ def compare_pair(one: Side, other: Side) -> Pair:
         covered = float(count @ np.array([row.covered for row in rows]) / count.sum())
     else:
         found = compare_estimates(one, other)
-        rows, notes, measured, covered = found.angles, found.notes, found.measured, found.covered
-    return Pair({row.name: row for row in rows}, measured, covered, notes)
+        rows, measured, covered = found.angles, found.measured, found.covered
+    return Pair({row.name: row for row in rows}, measured, covered)
 
 
 def known_shares(side: Side, seconds: float) -> dict[str, float]:
@@ -201,20 +199,26 @@ def replay_systems(bag: Path, systems: Mapping[str, list[str]], output: Path, *,
     """Replay a recording once with each system, each into a folder of its name.
 
     Raises:
+        EvaluationError: arguments that replay does not take.
         BodyTrackingError: as of replay.
     """
-    parser = argparse.ArgumentParser(prog="body_tracking compare", exit_on_error=False)
+    parser = argparse.ArgumentParser(exit_on_error=False)
     replay.add_parser(parser.add_subparsers())
-    made = []
-    for name, arguments in systems.items():
-        print(f"{name}: replay {' '.join(arguments)}", file=sys.stderr)
-        folder = output / name
-        given = ["replay", str(bag), "-o", str(folder), *arguments, *(["--overwrite"] if overwrite else [])]
-        args = parser.parse_args(given)
+    options = ["--overwrite"] if overwrite else []
+    parsed = {}
+    for name, arguments in systems.items():  # all before the first is replayed
+        try:
+            given = ["replay", str(bag), "-o", str(output / name), *options, *arguments]
+            parsed[name], unknown = parser.parse_known_args(given)
+        except argparse.ArgumentError as error:
+            raise EvaluationError(f"{name}: {error}") from error
+        if unknown:
+            raise EvaluationError(f"{name}: replay does not take {' '.join(unknown)}")
+    for name, args in parsed.items():
+        print(f"{name}: replay {' '.join(systems[name])}", file=sys.stderr)
         with contextlib.redirect_stdout(sys.stderr):
             args.run(args)
-        made.append(folder)
-    return made
+    return [output / name for name in systems]
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -21,9 +21,10 @@ from body_tracking.evaluation.metrics import wrapped
 from body_tracking.evaluation.reading import AngleSeries, EvaluationError
 from body_tracking.evaluation.reference_error import Differences, Judged, judge
 from body_tracking.evaluation.start_clock import STAMPS_AS_THEY_ARE, start_clock
+from body_tracking.kinematics.labels import UNKNOWN
 
-USABLE: Final = float(np.radians(30.0))
-"""Radians: an angle with a larger deviation counts as unknown. A robot that follows angles stops far below it."""
+USABLE: Final = float(np.radians(UNKNOWN))
+"""Radians of deviation from which on an angle counts as unknown."""
 LEAST_OVERLAP: Final = 2.0
 """Seconds that both recordings must cover."""
 _NORMAL: Final = 1.96

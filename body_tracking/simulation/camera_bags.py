@@ -21,22 +21,19 @@ from body_tracking.core.camera import Camera
 from body_tracking.core.message_types import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, POINT_CLOUD, TRANSFORM
 from body_tracking.core.qos import LATCHED, RELIABLE, SENSOR_DATA
 from body_tracking.core.sensor_poses import SensorPose, level_pose
-from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, Skeleton, TrackingState
 from body_tracking.core.sources import optical_frame
-from body_tracking.kinematics.positional import positional_angles
 from body_tracking.markers import setup
 from body_tracking.markers.rig import LENS, POSE, Rig
 from body_tracking.markers.rig_storage import save_rig
 from body_tracking.mesh.codecs import DepthImage, DepthInfo
 from body_tracking.mesh.topics import IMAGES
-from body_tracking.messages.angles import angles_to_joint_state
 from body_tracking.messages.calibration import pose_to_transform
 from body_tracking.messages.cameras import CAMERA_INFO
-from body_tracking.messages.cdr import encode_skeletons
 from body_tracking.pipeline import graph
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, BagWriter, serialize
 from body_tracking.simulation.colour_images import CAMERA, Painter, colour_camera
+from body_tracking.simulation.depth_bags import capture_times, truth_messages
 from body_tracking.simulation.depth_scene import RATE, DepthFrame, DepthScene, held_out
 from body_tracking.simulation.makehuman import makehuman_for
 from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS, WORLD
@@ -57,8 +54,6 @@ _EVERY: Final = 2
 """Every second image of 30 a second."""
 _WIDTH: Final = 480
 """Pixels of a colour image; a depth image has half of them."""
-_DELAY_NS: Final = 30_000_000
-"""From the capture of an image to its receipt."""
 _PAIR_FROM: Final = 2.0
 """Seconds of the motion that are left out: the person stands still."""
 _TRUTH: Final = {
@@ -129,7 +124,7 @@ def write_pair_bag(
         bag.write(graph.TRUE_CALIBRATION, serialize(pose_to_transform(pose, WORLD, BAG_MESSAGES)), RECEIVED_FROM_NS)
         progress = Progress(0, round(seconds * RATE) // _EVERY)
         for index, frame in enumerate(scene.frames(_PAIR_FROM, _PAIR_FROM + seconds, _EVERY)):
-            stamp_ns, log_ns = _times(frame.time - _PAIR_FROM)
+            stamp_ns, log_ns = capture_times(frame.time - _PAIR_FROM)
             for topic, painter in painters.items():
                 taken = (stamp_ns, optical_frame(painter.pose.sensor), painter.image(frame))
                 bag.write(topic, CompressedColour().encode(taken, BAG_WIRE), log_ns)
@@ -138,18 +133,9 @@ def write_pair_bag(
         progress.end()
 
 
-def _times(seconds: float) -> tuple[int, int]:
-    """Stamp of an image, and when it was received."""
-    stamp_ns = START_NS + round(seconds * NANOSECONDS)
-    return stamp_ns, RECEIVED_FROM_NS + stamp_ns - START_NS + _DELAY_NS
-
-
 def _write_truth(bag: BagWriter, scene: DepthScene, frame: DepthFrame, stamp_ns: int, log_ns: int) -> None:
-    tracked = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
-    truth = Skeleton(stamp_ns, WORLD, scene.pose.apply(frame.joints), tracked)
-    bag.write(graph.TRUE_SKELETON, encode_skeletons([truth]), log_ns)
-    angles = angles_to_joint_state(positional_angles(truth), graph.DEFAULT_BODY, WORLD, BAG_MESSAGES)
-    bag.write(graph.TRUE_ANGLES, serialize(angles), log_ns)
+    for received_ns, topic, cdr in truth_messages(scene.pose.apply(frame.joints), stamp_ns, log_ns):
+        bag.write(topic, cdr, received_ns)
 
 
 def write_camera_bag(scene: DepthScene, folder: Path, seconds: float, *, overwrite: bool = False) -> None:
@@ -176,7 +162,7 @@ def write_camera_bag(scene: DepthScene, folder: Path, seconds: float, *, overwri
         bag.write(graph.TRUE_CALIBRATION, serialize(pose), RECEIVED_FROM_NS)
         progress = Progress(0, round(seconds * RATE) // _EVERY)
         for index, frame in enumerate(scene.frames(0.0, seconds, _EVERY)):
-            stamp_ns, log_ns = _times(frame.time)
+            stamp_ns, log_ns = capture_times(frame.time)
             taken = (stamp_ns, painter.camera.frame_id, painter.image(frame))
             bag.write(colour, CompressedColour().encode(taken, BAG_WIRE), log_ns)
             bag.write(

@@ -93,21 +93,30 @@ def write_depth_bag(scene: DepthScene, folder: Path, seconds: float, *, overwrit
         messages, progress = [*inertial_messages(scene, seconds)], Progress(0, round(seconds * RATE))
         joints = []
         for index, frame in enumerate(scene.frames(0.0, seconds)):
-            stamp_ns = START_NS + round(frame.time * NANOSECONDS)
-            log_ns = RECEIVED_FROM_NS + stamp_ns - START_NS + _DELAY_NS
+            stamp_ns, log_ns = capture_times(frame.time)
             image = DepthImage().encode((stamp_ns, scene.camera.frame_id, frame.image), BAG_WIRE)
             messages.append((log_ns, depth_topic(SENSOR), image))
             joints.append(scene.pose.apply(frame.joints))
-            tracked = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
-            truth = Skeleton(stamp_ns, WORLD, joints[-1], tracked)
-            messages.append((log_ns, graph.TRUE_SKELETON, encode_skeletons([truth])))
-            angles = angles_to_joint_state(positional_angles(truth), graph.DEFAULT_BODY, WORLD, BAG_MESSAGES)
-            messages.append((log_ns, graph.TRUE_ANGLES, serialize(angles)))
+            messages += truth_messages(joints[-1], stamp_ns, log_ns)
             progress.at(index)
         messages += _skeletons(scene, np.array(joints))
         for log_ns, topic, cdr in sorted(messages, key=lambda item: item[:2]):
             bag.write(topic, cdr, log_ns)
         progress.end()
+
+
+def capture_times(seconds: float, delay_ns: int = _DELAY_NS) -> tuple[int, int]:
+    """Stamp of an image by the reference clock, and when it was received."""
+    elapsed_ns = round(seconds * NANOSECONDS)
+    return START_NS + elapsed_ns, RECEIVED_FROM_NS + elapsed_ns + delay_ns
+
+
+def truth_messages(joints: FloatArray, stamp_ns: int, log_ns: int) -> Iterator[tuple[int, str, bytes]]:
+    """Log time, topic and content of (25, 3) true joints in ``world``, and of their angles."""
+    truth = Skeleton(stamp_ns, WORLD, joints, np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8))
+    yield log_ns, graph.TRUE_SKELETON, encode_skeletons([truth])
+    angles = angles_to_joint_state(positional_angles(truth), graph.DEFAULT_BODY, WORLD, BAG_MESSAGES)
+    yield log_ns, graph.TRUE_ANGLES, serialize(angles)
 
 
 def _skeletons(scene: DepthScene, joints: FloatArray) -> Iterator[_Message]:

@@ -9,11 +9,10 @@ shoulder, upper arm and forearm (their balls are recorded in place of the images
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 
@@ -23,35 +22,28 @@ from body_tracking.core.clocks import ClockModel
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.message_types import COMPRESSED_IMAGE, IMAGE, IMU, JOINT_STATE, POINT_CLOUD, TRANSFORM
 from body_tracking.core.qos import LATCHED, RELIABLE, SENSOR_DATA, Qos
-from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, Skeleton, TrackingState
 from body_tracking.kinect.simulated_sensor import Misreading, SimulatedKinect
-from body_tracking.kinematics.positional import positional_angles
 from body_tracking.markers import setup
-from body_tracking.markers.boards import Chessboard
-from body_tracking.markers.camera_calibration import calibrate_cameras, find_boards
-from body_tracking.markers.chain_files import save_chain
+from body_tracking.markers.chain import JointDescription
 from body_tracking.markers.codecs import Balls
 from body_tracking.markers.detection import detect
-from body_tracking.markers.rig_storage import save_rig
-from body_tracking.markers.targets_file import save_targets
+from body_tracking.markers.joint_model import Joint
 from body_tracking.mesh.codecs import DepthImage, DepthInfo
 from body_tracking.mesh.topics import IMAGES, depth_topic, info_topic
-from body_tracking.messages.angles import angles_to_joint_state
 from body_tracking.messages.calibration import pose_to_transform
 from body_tracking.messages.cameras import CAMERA_INFO
 from body_tracking.messages.cdr import encode_skeletons
 from body_tracking.messages.model import estimate_to_joint_state
 from body_tracking.pipeline import graph
-from body_tracking.recording.marker_commands import fit_recording
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, BagWriter, serialize
 from body_tracking.simulation import marker_bags
 from body_tracking.simulation.camera_bags import pose_around
 from body_tracking.simulation.colour_images import CAMERA, Painter, colour_camera
-from body_tracking.simulation.depth_bags import inertial_messages
+from body_tracking.simulation.depth_bags import capture_times, inertial_messages, truth_messages
 from body_tracking.simulation.depth_scene import RATE, SENSOR, DepthScene, held_out, kinect_camera
 from body_tracking.simulation.makehuman import makehuman_for
-from body_tracking.simulation.marker_scene import DIAMETER, JOINTS, MarkerScene, scene_of
+from body_tracking.simulation.marker_scene import JOINTS, MarkerScene, scene_of
 from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.repertoire import make_movement
 from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS, WORLD, draw_clock
@@ -69,12 +61,10 @@ _EVERY: Final = 2
 """Every second image of 30 a second."""
 _WIDTH: Final = 480
 _IMU_RATE: Final = 60.0
-_DELAY_NS: Final = 30_000_000
-"""From the capture of an image to its receipt."""
 _BALLS_DELAY_NS: Final = 15_000_000
 _CHUNK_BYTES: Final = 32 << 20
-_FIT_RATE, _FIT_SECONDS = 15.0, 14.0
 
+_Joint = TypeVar("_Joint", Joint, JointDescription)
 _Message = tuple[int, str, bytes]
 """Log time, topic, serialised message."""
 
@@ -126,29 +116,20 @@ def make_shipped(bags: Path, config: Path) -> None:
 
 
 def _make_setup(scene: DepthScene, folder: Path) -> None:
-    """Calibrate the infrared cameras from rendered boards, and fit the joints to another motion of the same person."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """Calibrate the infrared cameras, and fit the joints to another motion of the same person."""
     person = scene.who.person
     movement = make_movement("random", person, np.random.default_rng([_SEED, 20110215]), None)
-    learnt = scene_of(person, movement.course(np.arange(round(_FIT_RATE * _FIT_SECONDS)) / _FIT_RATE), _SEED)
-    series = list(zip(*marker_bags.board_images(learnt.rig, 16, _SEED, marker_bags.DARK), strict=True))
-    frames = [camera.frame_id for camera in learnt.rig.cameras]
-    sizes = [(camera.width, camera.height) for camera in learnt.rig.cameras]
-    board = Chessboard(marker_bags.COLUMNS, marker_bags.ROWS, marker_bags.SQUARE)
-    save_rig(calibrate_cameras(frames, sizes, find_boards(board, series)).rig, folder / setup.RIG)
-    save_targets([replace(each, name=f"{each.name}_left") for each in learnt.targets], folder / setup.TARGETS)
+    times = np.arange(round(marker_bags.FIT_RATE * marker_bags.FIT_SECONDS)) / marker_bags.FIT_RATE
+    learnt = scene_of(person, movement.course(times), _SEED)
     # by the names of the segments, so that `evaluate` and `compare` know where each target is worn
-    joints = [replace(each, parent=f"{each.parent}_left", child=f"{each.child}_left") for each in JOINTS]
-    with tempfile.TemporaryDirectory() as temporary:
-        motion = Path(temporary) / "motion"
-        marker_bags.write_scene(learnt, motion, marker_bags.DARK, _SEED + 1)
-        save_chain(fit_recording(motion, folder, joints, DIAMETER).chain, folder / setup.CHAIN)
+    targets = tuple(replace(each, name=f"{each.name}_left") for each in learnt.targets)
+    chain = replace(learnt.chain, joints=tuple(map(_on_the_left, learnt.chain.joints)))
+    worn = replace(learnt, targets=targets, chain=chain)
+    marker_bags.make_setup(worn, folder, _SEED, [_on_the_left(each) for each in JOINTS])
 
 
-def _stamp(seconds: float, delay_ns: int = _DELAY_NS) -> tuple[int, int]:
-    """Stamp by the reference clock, and when it was received."""
-    elapsed_ns = round(seconds * NANOSECONDS)
-    return START_NS + elapsed_ns, RECEIVED_FROM_NS + elapsed_ns + delay_ns
+def _on_the_left(joint: _Joint) -> _Joint:
+    return replace(joint, parent=f"{joint.parent}_left", child=f"{joint.child}_left")
 
 
 def _depth_and_truth(scene: DepthScene) -> Iterator[_Message]:
@@ -157,15 +138,11 @@ def _depth_and_truth(scene: DepthScene) -> Iterator[_Message]:
     yield RECEIVED_FROM_NS, graph.TRUE_CALIBRATION, serialize(pose_to_transform(scene.pose, WORLD, BAG_MESSAGES))
     progress = Progress(0, round(SECONDS * RATE))
     for index, frame in enumerate(scene.frames(0.0, SECONDS)):
-        stamp_ns, log_ns = _stamp(frame.time)
+        stamp_ns, log_ns = capture_times(frame.time)
         if index % _EVERY == 0:
             image = DepthImage().encode((stamp_ns, scene.camera.frame_id, frame.image), BAG_WIRE)
             yield log_ns, depth_topic(SENSOR), image
-        tracked = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
-        truth = Skeleton(stamp_ns, WORLD, scene.pose.apply(frame.joints), tracked)
-        yield log_ns, graph.TRUE_SKELETON, encode_skeletons([truth])
-        angles = angles_to_joint_state(positional_angles(truth), graph.DEFAULT_BODY, WORLD, BAG_MESSAGES)
-        yield log_ns, graph.TRUE_ANGLES, serialize(angles)
+        yield from truth_messages(scene.pose.apply(frame.joints), stamp_ns, log_ns)
         q, lengths = scene.course(np.array([frame.time])).q[0], scene.who.person.lengths
         exact, unknown = np.zeros((2 * MODEL.nv, 2 * MODEL.nv)), np.full(MODEL.nv, np.nan)
         state = ModelEstimate(stamp_ns, WORLD, 0, q, unknown, exact, lengths, np.zeros_like(lengths))
@@ -180,7 +157,7 @@ def _colour(scene: DepthScene) -> Iterator[_Message]:
         yield RECEIVED_FROM_NS, topic, DepthInfo().encode((START_NS, camera), BAG_WIRE)
     progress = Progress(0, round(SECONDS * RATE) // _EVERY)
     for index, frame in enumerate(scene.frames(0.0, SECONDS, _EVERY)):
-        stamp_ns, log_ns = _stamp(frame.time)
+        stamp_ns, log_ns = capture_times(frame.time)
         taken = (stamp_ns, painter.camera.frame_id, painter.image(frame))
         yield log_ns, names.colour + COMPRESSED, CompressedColour().encode(taken, BAG_WIRE)
         depth = (stamp_ns, scene.camera.frame_id, frame.image)
@@ -209,7 +186,7 @@ def _balls(scene: MarkerScene) -> Iterator[_Message]:
     """The balls that the detector finds in rendered infrared images."""
     progress = Progress(0, len(scene.times))
     for index, time in enumerate(scene.times.tolist()):
-        stamp_ns, log_ns = _stamp(time, _BALLS_DELAY_NS)
+        stamp_ns, log_ns = capture_times(time, _BALLS_DELAY_NS)
         images = marker_bags.images(scene, index, marker_bags.DARK, _SEED)
         for camera, image in zip(scene.rig.cameras, images, strict=True):
             found = detect(image, stamp_ns, camera.frame_id)

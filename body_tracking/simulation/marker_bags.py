@@ -21,6 +21,7 @@ from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.markers import setup
 from body_tracking.markers.boards import Chessboard, Image
 from body_tracking.markers.camera_calibration import calibrate_cameras, find_boards
+from body_tracking.markers.chain import JointDescription
 from body_tracking.markers.chain_files import save_chain
 from body_tracking.markers.codecs import CameraImage, Info
 from body_tracking.markers.rendering import RenderingError, Sensor, render, render_chessboard
@@ -50,8 +51,8 @@ have it, and a filter that leaves no light but the balls'. Most dark pixels are 
 thirtieth; with the noise of :class:`Sensor` itself they compress to a fifth."""
 SEED, _MOTION = 10, "random"
 """A motion that turns all joints about all their axes, no angle near where it is not determined."""
-_RATE, _FIT_RATE = 30.0, 15.0
-_START, _SECONDS, _FIT_SECONDS = 15.0, 5.0, 14.0
+_RATE, FIT_RATE = 30.0, 15.0
+_START, _SECONDS, FIT_SECONDS = 15.0, 5.0, 14.0
 """The joints are fitted to the beginning of the motion, the recording is what follows later."""
 _BOARDS: Final = 16
 
@@ -223,8 +224,22 @@ def make_shipped(bags: Path, folder: Path) -> None:
     """
     scene = shipped_scene()
     write_scene(scene, bags / SHIPPED, DARK, SEED, overwrite=True)
+    make_setup(marker_scene(_MOTION, SEED, FIT_RATE, FIT_SECONDS, 0.0), folder, SEED)
+    size = sum(path.stat().st_size for path in (bags / SHIPPED).iterdir())
+    print(f"{bags / SHIPPED}: {len(scene.times)} pairs of images, {size / 1e6:.2f} MB; setup in {folder}")
+
+
+def make_setup(scene: MarkerScene, folder: Path, seed: int, joints: Sequence[JointDescription] = JOINTS) -> None:
+    """Calibrate the cameras of a scene from rendered boards, and fit the joints to its motion.
+
+    Args:
+        scene: its targets, whose geometry is known, move all joints.
+        folder: of the setup, whose files are replaced.
+        seed: of the boards and of the images' noise.
+        joints: between the targets.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    series = list(zip(*board_images(scene.rig, _BOARDS, SEED, DARK), strict=True))
+    series = list(zip(*board_images(scene.rig, _BOARDS, seed, DARK), strict=True))
     frames = [camera.frame_id for camera in scene.rig.cameras]
     sizes = [(camera.width, camera.height) for camera in scene.rig.cameras]
     found = calibrate_cameras(frames, sizes, find_boards(Chessboard(COLUMNS, ROWS, SQUARE), series))
@@ -232,10 +247,8 @@ def make_shipped(bags: Path, folder: Path) -> None:
     save_targets(scene.targets, folder / setup.TARGETS)
     with tempfile.TemporaryDirectory() as temporary:
         motion = Path(temporary) / "motion"
-        write_scene(marker_scene(_MOTION, SEED, _FIT_RATE, _FIT_SECONDS, 0.0), motion, DARK, SEED + 1)
-        save_chain(fit_recording(motion, folder, JOINTS, DIAMETER).chain, folder / setup.CHAIN)
-    size = sum(path.stat().st_size for path in (bags / SHIPPED).iterdir())
-    print(f"{bags / SHIPPED}: {len(scene.times)} pairs of images, {size / 1e6:.2f} MB; setup in {folder}")
+        write_scene(scene, motion, DARK, seed + 1)
+        save_chain(fit_recording(motion, folder, joints, DIAMETER).chain, folder / setup.CHAIN)
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -133,13 +133,15 @@ def test_another_estimate_is_a_reference_that_errs_itself(
         (["{one}", "--systems", "{yaml}"], "expected one RECORDING and -o FOLDER"),
         (["{one}", "--systems", "{yaml}", "-o", "{one}_out"], "expected a name and a list of arguments"),
         (["{one}", "--systems", "{one}.yaml", "-o", "{one}_out"], "one.yaml"),
+        (["{one}", "--systems", "{other}", "-o", "{one}_out"], "kinects: replay does not take --bogus"),
     ],
 )
 def test_wrong_arguments_are_reported_in_one_line(
     folder: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
 ) -> None:
     (folder / "bad.yaml").write_text("kinects: ekf\n")
-    names = {"one": folder / "one", "yaml": folder / "bad.yaml"}
+    (folder / "other.yaml").write_text("kinects: [--filter, ekf, --bogus]\n")
+    names = {"one": folder / "one", "yaml": folder / "bad.yaml", "other": folder / "other.yaml"}
     assert main(["compare", *(each.format(**names) for each in arguments)]) == 2
     reported = capsys.readouterr().err
     assert message in reported and reported.count("\n") == 1
