@@ -7,6 +7,10 @@ simulated   people of seeds that nothing was tuned on: all motions by turns, lay
 pairs       the nine real pairs of Kinect v2 sensors (``kinect_pairs``)
 clips       real exercises of the right arm before one Kinect v2 (``kinect_vs_vicon``)
 
+``unusual`` is the share of the known shoulders (all three deviations below 15 degrees, conventions of the model) whose
+angles are those of an unusual branch: in the sum more than 30 degrees outside their usual ranges, where the equivalent
+triple of the same rotation is inside. A step and an unusual branch both mislead who follows the angles.
+
 Recordings and pairs are replayed as ``body_tracking replay`` does, both filters in turns; clips are filtered frame by
 frame. ``known`` is the share of the frames with angles in which elevation, plane of elevation, elbow and trunk angles
 are stated with a deviation below 15 degrees (the plane where the arm is raised by 30 to 150). ``cpu`` is the
@@ -32,7 +36,7 @@ from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray
 from body_tracking.evaluation.metrics import wrapped
 from body_tracking.evaluation.reading import AngleSeries, read
 from body_tracking.filters import DEFAULT_FILTER, ModelFilter, make_filter
-from body_tracking.kinematics.conventions import angles_of
+from body_tracking.kinematics.conventions import CONVENTIONS, angles_of, convention
 from body_tracking.kinematics.positional import positional_angles
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.recording.importer import import_files
@@ -52,6 +56,7 @@ KNOWN = 90.0
 """Percent of the frames of a real pair."""
 PARTS = ("simulated", "pairs", "clips")
 RAISED = np.radians(30.0), np.radians(150.0)
+_UNUSUAL = np.radians(30.0)
 _FIRST_SEED = 5300
 """Far from the seeds of every other benchmark."""
 
@@ -76,6 +81,36 @@ def teleports(angles: AngleSeries) -> list[str]:
         f"{angles.names[column]} at {seconds[row + 1]:.2f} s by {np.degrees(steps[row, column]):.0f}"
         for row, column in np.argwhere((steps > STEP) & sure)
     ]
+
+
+def unusual(angles: AngleSeries) -> tuple[int, int]:
+    """How many shoulders are known, and how many of these are in an unusual branch."""
+    found = np.zeros(2, dtype=np.int64)
+    model = UpperBody()
+    chains = [
+        chain for name in CONVENTIONS if (c := convention(name, model)).names == angles.names for chain in c.chains
+    ]
+    for chain in chains:
+        if not all(name is not None and "shoulder" in name for name in chain.names):
+            continue
+        columns = [angles.names.index(str(name)) for name in chain.names]
+        triples, (low, high) = angles.position[:, columns], np.radians(np.array(chain.angles.usual)).T
+        first, _, last = chain.angles.axes
+        # two angles half a turn away, and the middle one mirrored: at 0 for proper Euler angles, at 90 for Cardan ones
+        mirrored = (0.0 if abs(first @ last) > 0.5 else np.pi) - triples[:, 1]
+        others = np.stack([triples[:, 0] + np.pi, mirrored, triples[:, 2] + np.pi], axis=1)
+        own, other = (_outside(each, low, high) for each in (triples, others))
+        sure = (angles.stddev[:, columns] < SURE).all(axis=1)
+        found += np.array([sure.sum(), (sure & (own > _UNUSUAL) & (other == 0.0)).sum()])
+    return int(found[0]), int(found[1])
+
+
+def _outside(triples: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """(n,) by how much (n, 3) angles, but for full turns, leave their ranges in the sum, radians."""
+    middle = 0.5 * (low + high)
+    inside = middle + wrapped(triples - middle)
+    outside: FloatArray = np.maximum(np.maximum(inside - high, low - inside), 0.0).sum(axis=1)
+    return outside
 
 
 def known(angles: AngleSeries) -> dict[str, float]:
@@ -128,6 +163,7 @@ def of_replays(job: Job) -> dict[str, dict[str, Any]]:
             angles = read(Path(folder) / name).angles
             found[name] = {
                 "teleports": teleports(angles),
+                "unusual": unusual(angles),
                 "frames": len(angles.stamps_ns),
                 "cpu": spent / report.recording_s,
                 "speed": report.recording_s / report.elapsed_s,
@@ -160,7 +196,7 @@ def of_clip(job: Job) -> dict[str, dict[str, Any]]:
             np.stack([each.position for each in series]),
             np.stack([each.position_stddev for each in series]),
         )
-        found[name] = {"teleports": teleports(angles), "frames": len(series)}
+        found[name] = {"teleports": teleports(angles), "unusual": unusual(angles), "frames": len(series)}
     return found
 
 
@@ -179,6 +215,9 @@ def summary(results: list[dict[str, dict[str, Any]]]) -> dict[str, dict[str, Any
             "frames": sum(each["frames"] for each in own),
             "teleports": sum(len(each["teleports"]) for each in own),
         }
+        shoulders, astray = (sum(each["unusual"][k] for each in own) for k in range(2))
+        if shoulders:
+            row["unusual"] = 100.0 * astray / shoulders
         for column in ("cpu", "speed", "elevation", "plane", "elbow", "trunk"):
             values = [each[column] for each in own if column in each]
             if values:

@@ -312,17 +312,18 @@ def resident(running: Running) -> dict[str, int]:
     return {name: psutil.Process(process.pid).memory_info().rss for name, process in running.processes.items()}
 
 
-GROWTH = {"bag_recorder": 0.15, "viewer": 0.08}
-"""Of memory, where more than 0.05: queues of 1000 messages keep the largest that each place ever had. The viewer levels
-off: with its topics alone it has 245 MB after 80,000 messages, 249 after 160,000, 252 after 320,000."""
+GROWTH = {"bag_recorder": 0.15}
+"""Of memory, where more than 0.05: queues of 1000 messages keep the largest that each place ever had."""
 
 
 @pytest.mark.parametrize("seed", [1])
 def test_no_message_drawn_at_random_ends_a_node_or_takes_memory(
     tmp_path: Path, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    count, rate = draws(2_000, 200_000), 1000.0
-    warm = count // 2
+    count, rate = draws(2_000, 300_000), 1000.0
+    # The viewer levels off late: with its topics alone it has 194 MB, 241 after 40,000 messages, 245 after 80,000, 249
+    # after 160,000 and 252 after 320,000; it has a third of these topics.
+    warm = count * 2 // 3
     monkeypatch.chdir(tmp_path)
     started = time.monotonic()
     with Running(tmp_path) as running:
