@@ -122,7 +122,7 @@ class RobotCommands(GraphNode):
                 raise
             convention = str(values.header.frame_id)
             if self.follower.receive_angles(angles, convention, self.now_ns(), time.monotonic_ns()):
-                self.log_throttled("jump", f"{topic}: time jumped back, resetting", period_s=1.0)
+                self.log_jump(topic)
         elif len(self.waiting) > _UNPAIRED:
             self.waiting.popitem(last=False)
             self.monitor.totals["unpaired"] += 1

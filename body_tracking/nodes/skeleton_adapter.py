@@ -70,7 +70,7 @@ class SkeletonAdapter(GraphNode):
             return
         stamp_ns, ids, points = markers_to_points(message)
         if self.monitor.message_in(self.topic, stamp_ns):
-            self.log_throttled("jump", f"{self.topic}: time jumped back", period_s=1.0)
+            self.log_jump(self.topic)
         stamp_ns = self.ros_time.stamp(stamp_ns, self.arrived_ns)
         skeletons = bodies_of(ids, points, stamp_ns, self.frame_id, self.joint_state)
         if skeletons:

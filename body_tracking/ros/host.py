@@ -128,7 +128,7 @@ class StageNode(GraphNode):
             raise
         stamp_ns = port.codec.stamp_ns(payload)
         if stamp_ns is not None and self.monitor.message_in(topic, stamp_ns):
-            self.log_throttled("jump", f"{self.full_name(topic)}: time jumped back, resetting", period_s=1.0)
+            self.log_jump(self.full_name(topic))
             self.stage.reset(topic)
         self.sent_ns = sent_ns
         self.publish(self.stage.take(topic, payload, Now(self.arrived_ns, self.arrived_waiting_ns)))

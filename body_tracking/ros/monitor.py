@@ -34,18 +34,20 @@ class Monitor:
         self.totals["received"] += 1
 
     def message_in(self, topic: str, stamp_ns: int) -> bool:
-        """Check the stamp of a message of an input; True when time jumped back."""
+        """Count a stamp of an input that is not next to the last one; True, uncounted, when time jumped back."""
         last, self._last_stamp[topic] = self._last_stamp.get(topic), stamp_ns
         if last is None:
             return False
         step = stamp_ns - last
         if step == 0:
             self.totals["repeated stamps"] += 1
+        elif step < -JUMP_BACK_NS:
+            return True
         elif step < 0:
             self.totals["stamps backwards"] += 1
         elif step > GAP_NS:
             self.totals["gaps"] += 1
-        return step < -JUMP_BACK_NS
+        return False
 
     def message_out(self, topic: str, delay_ns: int | None = None, latency_ns: int | None = None) -> None:
         """Count a message of an output.

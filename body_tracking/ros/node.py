@@ -33,6 +33,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import PointCloud2
 
 from body_tracking.core import names
+from body_tracking.core.clocks import jumped_back
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.parameters import Parameter, ParameterError, Value, to_ros, unknown_parameter
 from body_tracking.core.qos import RELIABLE as RELIABLE_QOS
@@ -146,6 +147,8 @@ class GraphNode(BatchNode):
         self._several_since: dict[str, float] = {}
         self.simulated = bool(self.get_parameter("use_sim_time").value)
         self._simulated_ns = 0
+        self._rewinds = self._rewinds_logged = 0  # backward jumps of /clock
+        self._rewinds_known: Counter[str] = Counter()
         self._sent_ns = 0  # wall time at which the newest handled message was sent
         self._alarms: list[Alarm] = []
         self.arrived_ns = 0
@@ -254,7 +257,9 @@ class GraphNode(BatchNode):
         self.sequences.note(graph.CLOCK_TOPIC, info["publication_sequence_number"])
         if info["source_timestamp"] < self._sent_ns:
             self.monitor.totals["late ticks"] += 1
-        self._simulated_ns = to_nanoseconds(clock.clock)
+        now_ns = to_nanoseconds(clock.clock)
+        self._rewinds += jumped_back(now_ns, self._simulated_ns)
+        self._simulated_ns = now_ns
         for alarm in self._alarms:
             alarm.look()
 
@@ -392,7 +397,7 @@ class GraphNode(BatchNode):
                 return
             skeletons: tuple[Skeleton, ...] = port.codec.decode(cdr, WIRE)
             if self.monitor.message_in(topic, skeletons[0].stamp_ns):
-                self.log_throttled("jump", f"{name}: time jumped back, resetting", period_s=1.0)
+                self.log_jump(name)
                 self.time_jumped_back(topic)
             handle(skeletons, sent_ns)
 
@@ -423,6 +428,23 @@ class GraphNode(BatchNode):
             subscription, (_, info) = messages[place]
             self.sequences.note(self._droppable[subscription], info["publication_sequence_number"])
         return [each for place, each in enumerate(messages) if place not in late] if late else messages
+
+    def log_jump(self, topic: str) -> None:
+        """Log and count that an input's stamps jumped back: a fault, unless the clock of a recording that is played
+        again, or from an earlier place, went back before them.
+
+        Args:
+            topic: full name.
+        """
+        if self._rewinds > self._rewinds_known[topic]:
+            self._rewinds_known[topic] = self._rewinds
+            if self._rewinds > self._rewinds_logged:
+                self._rewinds_logged = self._rewinds
+                self.get_logger().info("the recording goes on from an earlier place, resetting")
+                self.monitor.totals["rewinds"] += 1
+        else:
+            self.monitor.totals["time jumps"] += 1
+            self.log_throttled("jump", f"{topic}: time jumped back, resetting", period_s=1.0)
 
     def time_jumped_back(self, topic: str) -> None:
         """Reset the state, because the stamps of an input jumped back."""

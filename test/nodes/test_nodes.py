@@ -238,7 +238,8 @@ def test_one_sensor_gives_angles_and_a_person_who_leaves_comes_back(nodes: Runni
         cloud.header.stamp = to_time(start + 19 * FRAME_NS - back_ns, ROS)
         publisher.publish(cloud)
     assert nodes.until(lambda: nodes.number("fusion", "repeated stamps") == 1)
-    assert nodes.until(lambda: nodes.number("fusion", "stamps backwards") >= 2)
+    assert nodes.until(lambda: nodes.number("fusion", "stamps backwards") >= 1)
+    assert nodes.number("fusion", "time jumps") >= 1
     assert all(process.poll() is None for process in nodes.processes.values())
 
 
