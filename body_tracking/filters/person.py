@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from body_tracking.calibration.arm_directions import corrected_arms
-from body_tracking.core.clocks import ClockModel
+from body_tracking.core.clocks import ClockModel, jumped_back
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.orientation import SegmentOrientation
 from body_tracking.core.qos import Qos
@@ -142,6 +142,8 @@ class PersonFilter:
         self._skeleton = one_of_several or self._publish_skeleton
         self._wanted = wanted if wanted is not None else lambda topic: True
         self._predicted = 0
+        self._overtaken = 0
+        self._published_ns: int | None = None
         self._present = False
         self._received = dict.fromkeys(settings.sensors, 0)
 
@@ -156,6 +158,7 @@ class PersonFilter:
             counters |= {f"association {name}": count for name, count in self.people.counts.items()}
         if self._model_filter is not None:
             counters["predicted frames"] = self._predicted
+            counters["frames overtaken by predictions"] = self._overtaken
         return counters
 
     def set_pose(self, pose: SensorPose) -> None:
@@ -329,6 +332,7 @@ class PersonFilter:
         self._ordering.flush()
         self._prediction.stop()
         self._lengths.reset()
+        self._published_ns = None
         self._present = False
 
     def forget(self) -> None:
@@ -361,8 +365,16 @@ class PersonFilter:
         self._publish(graph.FILTERED, (skeleton,), skeleton.stamp_ns)
 
     def _send(self, skeleton: Skeleton | None, estimate: ModelEstimate) -> None:
-        """Publish an estimate and its skeleton; None for the filter's current one."""
+        """Publish an estimate and its skeleton; None for the filter's current one.
+
+        Stamps never go back: a frame that comes after a prediction of a later time counts in the next estimate.
+        """
         assert self._model_filter is not None
+        last_ns = self._published_ns
+        if last_ns is not None and estimate.stamp_ns < last_ns and not jumped_back(estimate.stamp_ns, last_ns):
+            self._overtaken += 1
+            return
+        self._published_ns = estimate.stamp_ns
         if self._wanted(graph.FILTERED):
             skeleton = skeleton or self._model_filter.filtered
             assert skeleton is not None

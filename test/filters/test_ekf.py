@@ -589,6 +589,29 @@ def test_an_arm_that_comes_back_elsewhere_is_found_within_two_frames() -> None:
             assert errors_of(outputs, truth, 2.05)[:, np.isin(POINTS, arm)].max() < 0.15, (seed, arm)
 
 
+def test_an_elbow_that_jumps_is_stated_as_uncertain_while_it_is_rejected() -> None:
+    """No step of more than 60 degrees between outputs of which both have a deviation below 15."""
+    elbow = MODEL.coordinate_names.index("elbow_flexion_right")
+    turn = np.zeros(MODEL.nv)
+    estimator, rng = ExtendedKalmanFilter(), np.random.default_rng(5)
+    found: list[tuple[float, float]] = []
+    for number in range(36):
+        turn[elbow] = 1.9 if number in (20, 21) or number >= 27 else 0.1
+        points = MODEL.forward(MODEL.integrate(MODEL.neutral(), turn), MODEL.default_lengths()).positions
+        positions, states = np.full((N_JOINTS, 3), np.nan), np.zeros(N_JOINTS, dtype=np.uint8)
+        positions[POINTS] = points + rng.normal(scale=0.004, size=points.shape)
+        states[POINTS] = TrackingState.TRACKED
+        if estimator.take(Skeleton(START_NS + number * NANOSECONDS // 30, "world", positions, states)):
+            estimate = known(estimator)
+            stddev = float(np.sqrt(estimate.covariance[elbow, elbow]))
+            found.append((float(estimate.q[MODEL.scalar_q[MODEL.scalar_v == elbow][0]]), stddev))
+    angles, stddevs = np.degrees(np.array(found)).T
+    steps = np.abs(np.diff(angles)) > 60.0
+    assert estimator.counters["rejected"] > 4 and angles.max() > 90.0
+    assert (np.maximum(stddevs[1:], stddevs[:-1])[steps] > 15.0).all()
+    assert stddevs[10:15].max() < 10.0
+
+
 def test_outliers_hardly_matter() -> None:
     """5 % of the points are off by up to 1 m."""
     clean: list[float] = []

@@ -222,9 +222,10 @@ def test_a_skeleton_that_nobody_wants_is_not_made(events: list[Event]) -> None:
 def test_nothing_is_predicted_for_a_time_of_which_frames_wait(events: list[Event]) -> None:
     rng = np.random.default_rng(1)
     kept = [event for event in events if rng.uniform() > 0.2]
-    for settings in some([{"order_wait": 0.3}, {}]):
+    for settings in some([{"order_wait": 0.3}, {"predict_after": 0.02}, {}], 2):
         _, published, _ = staged(kept, **settings)
         stamps = [stamp_ns for topic, stamp_ns in published if topic == graph.FILTERED]
+        # a prediction may overtake a frame, whose estimate is not published then
         assert len(stamps) > 40 and stamps == sorted(stamps)
 
 

@@ -8,7 +8,7 @@ from scipy.linalg import block_diag
 from body_tracking.calibration.joint_centres import JointCentres
 from body_tracking.core.measurement import joint_correlation
 from body_tracking.core.skeleton import N_JOINTS, FloatArray
-from body_tracking.filters.ekf.kernels import displaced
+from body_tracking.filters.ekf.kernels import displacing
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.state import State, StateSpace
 from body_tracking.kinematics.compiled_body import Linearised
@@ -33,8 +33,11 @@ class Displacement:
         self._correlation = np.kron(correlation, np.eye(_DIMENSIONS))
         self._prior_information = block_diag(np.diag(space.rest_information), np.linalg.inv(space.lengths_covariance))
 
-    def displaced(self, state: State) -> FloatArray:
-        """(53, 53) covariance of tangent and lengths by offsets of the joint centres.
+    def displaced(self, state: State) -> tuple[FloatArray, FloatArray]:
+        """(53, 53) covariance of tangent and lengths by offsets of the joint centres; (53,) change by rejected points.
+
+        A rejected point is either an outlier, or shows a pose that the filter has lost, off by this change (the
+        spread of innovations of probabilistic data association, Bar-Shalom and Tse 1975).
 
         By constant offsets ``b`` of covariance ``B`` the pose that fits best is off by ``G b`` with
         ``G = (H^T W H + P^-1)^-1 H^T W``, where ``W`` is how the filter weighs the points and ``P`` what is known
@@ -47,15 +50,18 @@ class Displacement:
             (1.0 / (sensor.white + sensor.slow * space.base_variance) for sensor in state.sensors.values()),
             np.zeros(space.points),
         )
-        offsets = self._parameters.offset_scale * np.sqrt(space.base_variance)
+        stated = any(sensor.stated for sensor in state.sensors.values())
+        scale = self._parameters.offset_scale if stated else 0.0
+        offsets = scale * np.sqrt(space.base_variance)
         if state.sources.names:
             weights = np.where(space.thumbs[state.sources.segments].any(axis=0), 0.0, weights)
         if self._centres.offsets is not None:
-            spread = self._parameters.offset_scale**2 * self._left(state, lines)
+            spread = scale**2 * self._left(state, lines)
         else:
             deviations = offsets.repeat(_DIMENSIONS)
             spread = self._correlation * deviations * deviations[:, None]
-        return displaced(lines.observation, weights, self._prior_information, spread)
+        gain = displacing(lines.observation, weights, self._prior_information)
+        return gain @ spread @ gain.T, gain @ state.disputed
 
     def _left(self, state: State, lines: Linearised) -> FloatArray:
         """(57, 57) covariance of the points' offsets after a T-pose."""

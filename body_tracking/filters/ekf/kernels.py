@@ -76,14 +76,13 @@ def upright(
 
 
 @compiled
-def displaced(observation: FloatArray, weights: FloatArray, information: FloatArray, spread: FloatArray) -> FloatArray:
-    """(53, 53) covariance G B G^T by constant offsets, G = (H^T W H + P^-1)^-1 H^T W.
+def displacing(observation: FloatArray, weights: FloatArray, information: FloatArray) -> FloatArray:
+    """(53, 57) by how much a pose is off when points are: G = (H^T W H + P^-1)^-1 H^T W.
 
     Args:
         observation: (57, 53) H.
         weights: (19,) diagonal of W, for each point.
         information: (53, 53) P^-1.
-        spread: (57, 57) B.
     """
     weighted = observation.T.copy()
     size = len(weighted)
@@ -102,8 +101,7 @@ def displaced(observation: FloatArray, weights: FloatArray, information: FloatAr
         pivot = 1.0 / factor[k, k]
         for j in range(right.shape[1]):
             right[k, j] *= pivot
-    result: FloatArray = np.dot(np.dot(right, spread), right.T)
-    return result
+    return right
 
 
 @compiled

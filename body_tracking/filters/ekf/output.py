@@ -50,12 +50,14 @@ class Output:
         space = self._space
         if self._last_handed_out is None or self._last_handed_out[0] is not state:
             q, covariance = state.q, state.covariance[: space.size, : space.size].copy()
-            if self._parameters.offset_scale and any(sensor.stated for sensor in state.sensors.values()):
-                covariance[: space.observed, : space.observed] += self._displacement.displaced(state)
+            known = covariance[: space.observed, : space.observed]
+            offsets, disputed = self._displacement.displaced(state)
+            known += offsets
             if state.sources.names:
                 q = self._middled(q, state.covariance[space.tangent, space.tangent])
             elif self._parameters.posture:
                 q = self._upright(q, state.lengths, covariance)
+            known += np.outer(disputed, disputed)
             self._last_handed_out = state, q, covariance
         return self._last_handed_out[1:]
 

@@ -129,6 +129,7 @@ class PoseSearch:
             (),
             np.empty((size, 0), dtype=np.float32),
             np.zeros(space.points),
+            np.zeros(3 * space.points),
             np.full(space.points, stamp_ns, dtype=np.intp),
             0.0,
             0.0 if previous is None else previous.tracked,

@@ -37,6 +37,9 @@ _ENOUGH_BLOCKS = 5
 _LENGTHS_PERIOD = 0.75
 """Seconds that they are left alone for: several sensors' blocks of a second are brought in together."""
 
+_REACH = 0.8
+"""Metres: no pose that was lost is farther off than an arm is long."""
+
 
 class _Expected(NamedTuple):
     """A frame against what was expected of it.
@@ -128,6 +131,7 @@ class SkeletonUpdate:
         self._counters["rejected"] += int(np.count_nonzero(measurement.measured)) - count
         state = state.but(
             rejected_for=rejected_for,
+            disputed=self._disputed(state, measurement, seen.innovation, rejected_for),
             used_ns=np.where(used, measurement.stamp_ns, state.used_ns),
         )
         learnt = self._sensors.seen_by(sensor, measurement, used)
@@ -213,6 +217,14 @@ class SkeletonUpdate:
             crosses=crosses,
             sources=state.sources if len(correction) == space.size else state.sources.moved(correction[space.size :]),
         )
+
+    def _disputed(
+        self, state: State, measurement: Measurement, innovation: FloatArray, rejected_for: FloatArray
+    ) -> FloatArray:
+        """(57,) ``State.disputed`` after a frame: 0 of accepted points, as before of unseen ones."""
+        share = np.minimum(rejected_for / max(self._parameters.reacquire_after, 1e-3), 1.0)
+        disputed = np.sqrt(share).repeat(3) * np.clip(innovation, -_REACH, _REACH)
+        return np.where(measurement.measured.repeat(3), disputed, state.disputed)
 
     def _expected(
         self,

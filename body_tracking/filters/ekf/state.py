@@ -97,6 +97,8 @@ class State(Changeable):
             single precision: seven digits are enough for considered states, and with four cameras half the size of this
             largest matrix saves an eighth of a frame's time.
         rejected_for: (19,) seconds.
+        disputed: (57,) metres, innovations of rejected points, times the square root of the share of the time after
+            which another pose is searched for; 0 of accepted points.
         used_ns: (19,) stamp of the last accepted measurement of each point.
         since_prior: seconds since ranges of motion were last applied.
         tracked: seconds since the start.
@@ -121,6 +123,7 @@ class State(Changeable):
     slow_names: tuple[str, ...]
     crosses: SingleArray
     rejected_for: FloatArray
+    disputed: FloatArray
     used_ns: IntArray
     since_prior: float
     tracked: float
