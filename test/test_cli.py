@@ -41,7 +41,7 @@ def test_without_a_command_it_says_what_to_do_next(nobody: Path, capsys: pytest.
         assert cli.main([]) == 0
         return capsys.readouterr().out
 
-    assert "Recordings that come with the package: tpose_" in said()
+    assert "Recordings that come with the package: tpose_" in said() and "  body_tracking view\n" in said()
     (nobody / "bags").mkdir()
     (nobody / "bags" / "mine").symlink_to(ROOT / "bags" / "tpose_wave")
     text = said()

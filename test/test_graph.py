@@ -56,11 +56,12 @@ def test_every_parameter_in_the_table_is_one_of_its_node(options: Options) -> No
                 assert known[name].check(value) == value
 
 
-CLOUD, IMAGES, READINGS, MARKERS = (
+CLOUD, IMAGES, JPEGS, READINGS, MARKERS = (
     f"{package}/msg/{name}"
     for package, name in (
         ("sensor_msgs", "PointCloud2"),
         ("sensor_msgs", "Image"),
+        ("sensor_msgs", "CompressedImage"),
         ("sensor_msgs", "Imu"),
         ("visualization_msgs", "MarkerArray"),
     )
@@ -85,6 +86,10 @@ CLOUD, IMAGES, READINGS, MARKERS = (
         (
             {"/camera/d435/color/image_raw": IMAGES, "/camera/d435/aligned_depth_to_color/image_raw": IMAGES},
             {"camera": ("d435",), "driver": "realsense"},
+        ),
+        (
+            {"/a/color/image_raw/compressed": JPEGS, "/a/depth/image_raw": IMAGES},
+            {"camera": ("a",), "compressed": "colour"},
         ),
         ({"/a/depth/image_raw": IMAGES}, {"depth": ("a",)}),
     ],

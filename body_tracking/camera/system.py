@@ -5,7 +5,15 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 
-from body_tracking.camera.topics import COMPRESSION, DRIVERS, RIG_SENSOR, CameraTopics, images_of, people_topic
+from body_tracking.camera.topics import (
+    COMPRESSED,
+    COMPRESSION,
+    DRIVERS,
+    RIG_SENSOR,
+    CameraTopics,
+    images_of,
+    people_topic,
+)
 from body_tracking.core.message_types import COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
 from body_tracking.core.parameters import Value
 from body_tracking.core.qos import RELIABLE
@@ -58,6 +66,15 @@ def _finds(topics: Mapping[str, str]) -> dict[str, Value]:
     return {}
 
 
+def _finds_compressed(topics: Mapping[str, str]) -> dict[str, Value]:
+    """As :func:`_finds`, those whose colour images come compressed alone, as in a recording."""
+    plain = {
+        topic.removesuffix(COMPRESSED): IMAGE if kind == COMPRESSED_IMAGE else kind for topic, kind in topics.items()
+    }
+    found = _finds(plain)
+    return {**found, "compressed": "colour"} if found else {}
+
+
 def _pictures(options: Options) -> dict[str, Value]:
     """For the page."""
     return {"picture_rate": 5.0} if options["viewer"] else {}
@@ -108,7 +125,7 @@ SYSTEM = System(
     ),
     specs=_specs,
     played=_played,
-    finds=_finds,
+    finds=lambda topics: _finds(topics) or _finds_compressed(topics),
     computes=lambda options: (*_cameras(options), *_rig(options)),
     options=(
         Option(

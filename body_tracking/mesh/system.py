@@ -57,7 +57,9 @@ def _finds(topics: Mapping[str, str]) -> dict[str, Value]:
     found = tuple(
         each
         for each in cameras
-        if "/" not in each and topics.get(depth_topic(each)) == IMAGE and f"/{each}/color/image_raw" not in topics
+        if "/" not in each
+        and topics.get(depth_topic(each)) == IMAGE
+        and not {f"/{each}/color/image_raw", f"/{each}/color/image_raw/compressed"} & topics.keys()
     )
     return {"depth": found} if found and not graph.sensors_among(topics) else {}
 

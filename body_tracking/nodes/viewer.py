@@ -358,6 +358,10 @@ class ViewerNode(GraphNode):
             raise PageError(answer.message or f"{service}: refused")
         return str(answer.message) or "done"
 
+    def offers(self, service: str) -> bool:
+        """Whether a node offers this service."""
+        return not self.ended.is_set() and bool(self.triggers[service].service_is_ready())
+
     def seek(self, place_s: float) -> str:
         """Continue the bag at a place."""
         self.seeks += 1

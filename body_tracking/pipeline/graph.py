@@ -25,6 +25,8 @@ from body_tracking.core.sources import check_sensor_name
 PARENT_VARIABLE = "BODY_TRACKING_SUPERVISOR"
 """Environment variable: id of the process with which a node ends."""
 
+END = "graph/end"
+"""The service of ``up`` that ends the graph."""
 UP_NODE = "body_tracking_up"
 """Begins the name of the node of ``body_tracking up``."""
 

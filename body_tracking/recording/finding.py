@@ -3,9 +3,18 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Final
 
 import body_tracking
+from body_tracking.core.parameters import Value
+
+SETUPS: Final[Mapping[str, Mapping[str, Value]]] = {
+    "cameras_turning": {"camera_rig": "config/camera_rig", "compressed": "colour"},
+    "markers_arm": {"marker_setup": "config/marker_setup", "sensors": ()},
+}
+"""Options of ``up`` that play those of the shipped recordings whose sensors cannot be found by their topics."""
 
 
 def is_bag(path: Path) -> bool:
@@ -27,10 +36,24 @@ def bags_in(folder: Path) -> tuple[Path, ...]:
 
 def shipped_bags() -> tuple[Path, ...]:
     """The recordings of the repository or of the installed package."""
+    found = _shipped()
+    return () if found is None else tuple(sorted(filter(is_bag, (found / "bags").iterdir()), key=_rank))
+
+
+def shipped_setup(bag: Path) -> Mapping[str, Value]:
+    """Options of ``up`` that a shipped recording needs; none for other recordings."""
+    found = _shipped()
+    if found is None or bag.resolve().parent != (found / "bags").resolve():
+        return {}
+    own = SETUPS.get(bag.name, {})
+    return {name: str(found / each) if isinstance(each, str) and "/" in each else each for name, each in own.items()}
+
+
+def _shipped() -> Path | None:
+    """The folder with ``bags`` and ``config``."""
     beside = Path(body_tracking.__file__).parents[1]
     places = (beside, *(each / "share" / "body_tracking" for each in (Path(sys.prefix), *beside.parents)))
-    found = next((place / "bags" for place in places if (place / "bags").is_dir()), None)
-    return () if found is None else tuple(sorted(filter(is_bag, found.iterdir()), key=_rank))
+    return next((place for place in places if (place / "bags").is_dir()), None)
 
 
 def _rank(bag: Path) -> tuple[bool, str]:

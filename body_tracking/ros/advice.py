@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final, TypeAlias
 
 from body_tracking.ros import dds
-from body_tracking.ros.up import flags
+from body_tracking.ros.up import flags, has_sensors
 
 _PATIENCE: Final = 1.5
 """Seconds for sensors to be discovered."""
@@ -28,9 +28,11 @@ def steps(folder: Path) -> Iterator[Step]:
         yield "The client library of ROS is not here, so no graph can run. Install it, or source a ROS install:", ways
         yield from _recordings(folder, page, live=False)
         return
+    if page:
+        yield "Choose a recording or sensors on a page in the browser, which then shows them:", ("body_tracking view",)
     yield from _domain(page)
     for file in sorted(folder.glob("*.yaml")):
-        if _has_sensors(file):
+        if has_sensors(file):
             yield (
                 f"{file.name} names sensors. Start the graph with them:",
                 (f"body_tracking up --params-file {file.name}{page}",),
@@ -66,14 +68,6 @@ def _domain(page: str) -> Iterator[Step]:
             f"No sensor publishes in ROS domain {name}. Once yours do, start the graph with them:",
             (f"body_tracking up{page}",),
         )
-
-
-def _has_sensors(file: Path) -> bool:
-    try:
-        text = file.read_text(encoding="utf-8")
-    except (OSError, ValueError):
-        return False
-    return "ros__parameters" in text and "_skeleton:" in text and ("backend:" in text or "file:" in text)
 
 
 def _recordings(folder: Path, page: str, *, live: bool) -> Iterator[Step]:

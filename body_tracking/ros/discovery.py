@@ -5,9 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Self
 
 import rclpy
-from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from body_tracking.core import names
@@ -20,6 +21,7 @@ PATIENCE = 4.0
 SETTLED = 1.0
 """Seconds without another topic after which all are known."""
 _LOOK = 0.1
+_OWN_NAME = "body_tracking_look"
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,37 +31,55 @@ class Domain:
     Attributes:
         sensors: the options of a graph that takes the sensors that publish; empty where none does.
         runs: whether a ``body_tracking up`` runs.
+        nodes: full names, sorted.
     """
 
     sensors: Mapping[str, Value] = field(default_factory=dict)
     runs: bool = False
+    nodes: tuple[str, ...] = field(default=(), compare=False)
+
+
+class Watch:
+    """Discovers what is in the ROS domain until it is closed; the first nodes appear after a second or so.
+
+    Args:
+        namespace: in which sensors are looked for.
+    """
+
+    def __init__(self, namespace: str = "/") -> None:
+        self._namespace, self._context = namespace, rclpy.Context()
+        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        name = f"{_OWN_NAME}_{time.time_ns()}"
+        self._node = rclpy.create_node(name, namespace=namespace, context=self._context)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: object, traceback: TracebackType | None) -> None:
+        self._node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+
+    def now(self) -> Domain:
+        """What has been discovered and is there still."""
+        topics: dict[str, str] = {}
+        for topic, kinds in self._node.get_topic_names_and_types():
+            own = names.within(topic, self._namespace)
+            if own is not None and kinds and self._node.count_publishers(topic):
+                topics[own] = kinds[0]
+        there = self._node.get_node_names_and_namespaces()
+        runs = any(name.startswith(f"{UP_NODE}_") and where == self._node.get_namespace() for name, where in there)
+        nodes = {f"{where.rstrip('/')}/{name}" for name, where in there if not name.startswith((_OWN_NAME, "_"))}
+        return Domain(found_sensors(topics), runs, tuple(sorted(nodes)))
 
 
 def look(namespace: str = "/", patience: float = PATIENCE, stopped: Callable[[], bool] = lambda: False) -> Domain:
     """Look until sensors are found and no more appear, or for ``patience`` seconds where there are none."""
-    context = rclpy.Context()
-    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        node = rclpy.create_node(f"body_tracking_look_{time.time_ns()}", namespace=namespace, context=context)
-        end, found = time.monotonic() + patience, Domain()
+    end, found = time.monotonic() + patience, Domain()
+    with Watch(namespace) as watch:
         while time.monotonic() < end and not stopped():
             time.sleep(_LOOK)
-            now = _domain(node, namespace)
+            now = watch.now()
             if now != found:
                 end = max(end, time.monotonic() + SETTLED) if not now.sensors else time.monotonic() + SETTLED
                 found = now
-        node.destroy_node()
-        return found
-    finally:
-        rclpy.try_shutdown(context=context)
-
-
-def _domain(node: Node, namespace: str) -> Domain:
-    topics: dict[str, str] = {}
-    for topic, kinds in node.get_topic_names_and_types():
-        own = names.within(topic, namespace)
-        if own is not None and kinds and node.count_publishers(topic):
-            topics[own] = kinds[0]
-    others = node.get_node_names_and_namespaces()
-    runs = any(name.startswith(f"{UP_NODE}_") and where == node.get_namespace() for name, where in others)
-    return Domain(found_sensors(topics), runs)
+    return found

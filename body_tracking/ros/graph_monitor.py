@@ -15,6 +15,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
 
 from body_tracking.core import names
 from body_tracking.core.qos import RELIABLE
@@ -47,6 +48,8 @@ class GraphMonitor:
         """Steady time of receipt of the latest angles, seconds."""
         self.angles = 0
         """Number of received angle messages."""
+        self.end_asked = False
+        """Whether somebody has called the service that ends the graph."""
         self._angles_topics = tuple(angles_topics)
         self._statuses: dict[str, NodeStatus] = {}
         self._context = rclpy.Context()
@@ -63,6 +66,7 @@ class GraphMonitor:
             self._node.create_subscription(JointState, name, self._on_angles, qos)
         clock_qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         self._node.create_subscription(Clock, graph.CLOCK_TOPIC, self._on_clock, clock_qos)
+        self._node.create_service(Trigger, graph.END, self._on_end)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._thread = threading.Thread(target=self._spin, daemon=True)
@@ -89,6 +93,11 @@ class GraphMonitor:
     def _on_clock(self, message: Any) -> None:
         with contextlib.suppress(MessageError):
             self.clock_ns = to_nanoseconds(message.clock)
+
+    def _on_end(self, request: Any, response: Any) -> Any:
+        self.end_asked = response.success = True
+        response.message = "the graph ends"
+        return response
 
     def has_predecessor(self) -> bool:
         """Whether another ``up`` was started earlier in this domain and namespace and still runs.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from body_tracking.core.message_types import DIAGNOSTICS
 from body_tracking.core.qos import RELIABLE
 from body_tracking.pipeline import graph
-from body_tracking.pipeline.system import Command, Option, System, TopicSpec
+from body_tracking.pipeline.system import Command, Option, Service, System, TopicSpec
 
 SYSTEM = System(
     "graph",
@@ -25,7 +25,11 @@ SYSTEM = System(
             "once a second: rates, gaps, drops, malformed messages, delay, calibration quality",
         ),
     ),
+    services=(Service(graph.END, "up", "end the whole graph, as Ctrl-C does"),),
     commands=(
+        Command(
+            "view", "body_tracking.ros.view", "open a page in the browser to choose a recording or sensors, and watch"
+        ),
         Command("up", "body_tracking.ros.up", "run the live graph: sensors or a bag in, joint angles out"),
         Command(
             "doctor",

@@ -82,6 +82,9 @@ STOP_TIMEOUT = 12.0
 FINISH_TIMEOUT = 60.0
 """Seconds for a node to handle its remaining messages after the end of a bag."""
 
+ANSWER_DELAY = 0.3
+"""Seconds for the answer to who asked for the graph's end."""
+
 LOOK_PERIOD = 0.25
 """Seconds between two looks at the graph, for the status line and for another ``up``."""
 
@@ -280,14 +283,16 @@ class Supervisor:
         self.children = [Child(spec, dict(parameters[spec.name])) for spec in specs]
         # Not an Event: its lock may be held by the very wait that a signal interrupts.
         self.stopping = False
+        self.interrupted = False
+        """A signal was received."""
         self.failure = ""
         self._bag_start_ns = 0
         if options["bag"]:
             with RigReader(str(options["bag"])) as reader:
                 self._bag_start_ns = reader.start_ns
 
-    def run(self, monitor: GraphMonitor) -> int:
-        """Run until the bag ends, a signal is received or a node cannot start; returns the exit code."""
+    def run(self, monitor: GraphMonitor) -> None:
+        """Run until the bag ends, somebody ends it or a node cannot start, for which :attr:`failure` has the reason."""
         handlers = {number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
         handlers[signal.SIGHUP] = signal.signal(signal.SIGHUP, self._on_signal)
         begin = time.monotonic()
@@ -310,6 +315,9 @@ class Supervisor:
                         "end it, or give this one another ROS_DOMAIN_ID"
                     )
                     break
+                if monitor.end_asked:
+                    time.sleep(ANSWER_DELAY)
+                    break
                 self.console.status(monitor.line(self.options, looked - begin, self._restarts()))
         finally:
             self._stop_all()
@@ -318,13 +326,12 @@ class Supervisor:
         self.console.end()
         if self.failure:
             self.console.line(f"body_tracking: {self.failure}", error=True)
-            return 2
+            return
         self.console.line(monitor.summary(self.options, time.monotonic() - begin, self._restarts()))
         self.console.line(f"logs: {self.folder}")
-        return 0
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        self.stopping = True
+        self.stopping = self.interrupted = True
 
     def _restarts(self) -> dict[str, int]:
         return {child.spec.name: child.restarts for child in self.children if child.restarts}
@@ -488,6 +495,15 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.set_defaults(run=run)
 
 
+def has_sensors(file: Path) -> bool:
+    """Whether a parameters file says what the node of a sensor reads."""
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, ValueError):
+        return False
+    return "ros__parameters" in text and "_skeleton:" in text and ("backend:" in text or "file:" in text)
+
+
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         raise UpError(message.removeprefix("argument --"))  # launch has no dashes
@@ -500,7 +516,8 @@ def arguments_from(words: Sequence[str]) -> argparse.Namespace:
     return parser.parse_args(["up", *words])
 
 
-def _no_ros(error: ImportError) -> UpError:
+def no_ros(error: ImportError) -> UpError:
+    """The error of a command that needs ROS where ROS cannot be imported."""
     return UpError(f"no ROS here ({error}): pip install 'body_tracking[ros]', or source a ROS install")
 
 
@@ -512,7 +529,7 @@ def _sensors_there(namespace: str) -> Mapping[str, Value]:
     try:
         from body_tracking.ros.discovery import look
     except ImportError as error:
-        raise _no_ros(error) from error
+        raise no_ros(error) from error
     found = look(namespace).sensors
     if not found:
         others = (
@@ -521,7 +538,7 @@ def _sensors_there(namespace: str) -> Mapping[str, Value]:
         raise UpError(
             f"no sensor publishes in ROS domain {os.environ.get('ROS_DOMAIN_ID') or '0'} {others}: no skeletons, depth "
             "images or readings of inertial sensors. Play a recording with --bag BAG, name the sensors with "
-            "--params-file FILE, or see what publishes: body_tracking doctor"
+            "--params-file FILE, choose on a page with body_tracking view, or see what publishes: body_tracking doctor"
         )
     print(f"found: {' '.join(flags(found))}", flush=True)
     return found
@@ -543,12 +560,31 @@ def run(args: argparse.Namespace) -> int:
     if look_for and not names_sensors(options_from(args)):
         options_for(args)  # raises before anything starts
         found = _sensors_there(names.check_namespace(args.namespace or "/"))
+    supervisor = supervise(args, found)
+    return 2 if supervisor.failure else 0
+
+
+def supervise(
+    args: argparse.Namespace,
+    found: Mapping[str, Value] = MappingProxyType({}),
+    settings: Mapping[str, Mapping[str, Value]] = MappingProxyType({}),
+) -> Supervisor:
+    """Run a graph to its end; returns what ran it.
+
+    Args:
+        args: the command line.
+        found: further options, for sensors that publish.
+        settings: parameters by node name that override all others.
+
+    Raises:
+        BodyTrackingError: the graph cannot be started with these options.
+    """
     options = options_for(args, found)
     specs = nodes_for(options)
     try:
         from body_tracking.ros.graph_monitor import GraphMonitor
     except ImportError as error:
-        raise _no_ros(error) from error
+        raise no_ros(error) from error
     all_parameters(options, specs, args.params_file)  # raises before a folder is made
     folder = _log_folder(args.log_dir)
     dds.stay_on_this_machine()
@@ -562,8 +598,11 @@ def run(args: argparse.Namespace) -> int:
     for spec in specs:
         if spec.executable == "kinect_skeleton" and not parameters[spec.name].get("start_time"):
             parameters[spec.name]["start_time"] = start
+        parameters[spec.name] |= settings.get(spec.name, {})
     monitor = GraphMonitor(angles_topics(specs, parameters), str(options["namespace"]))
+    supervisor = Supervisor(options, specs, parameters, folder)
     try:
-        return Supervisor(options, specs, parameters, folder).run(monitor)
+        supervisor.run(monitor)
     finally:
         monitor.close()
+    return supervisor

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
 import trimesh
 import viser
 
-from body_tracking.core.skeleton import FloatArray
+from body_tracking.core.skeleton import FloatArray, IntArray
 from body_tracking.viewing.colours import Colour, ColourArray, linear
-from body_tracking.viewing.shapes import figure
+from body_tracking.viewing.shapes import figure, joint_label
 from body_tracking.viewing.snapshot import Seen
 
 BALL: Final = trimesh.creation.icosphere(subdivisions=2)
@@ -19,19 +20,31 @@ STALE: Final[Colour] = (190, 190, 190)
 
 
 class Drawn:
-    """Skeletons of one source: joints as balls, bones as lines."""
+    """Skeletons of one source: joints as balls, bones as lines; a click on a joint shows or hides its name."""
 
     def __init__(self, scene: viser.SceneApi, name: str, colour: Colour, radius: float, thickness: float) -> None:
         self._scene, self._name, self._colour, self._thickness = scene, name, colour, thickness
         self._radius = radius
-        self._joints = Shapes(scene, f"{name}/joints", BALL, colour)
+        self._joints = Shapes(scene, f"{name}/joints", BALL, colour, clicked=self._on_click)
         self._lines: Any = None
+        self._which: IntArray = np.empty((0, 2), np.intp)
+        self._named: set[tuple[int, int]] = set()
+        self._labels: dict[tuple[int, int], Any] = {}
 
     def hide(self) -> None:
         self.draw(Seen(), False)
 
-    def draw(self, seen: Seen, visible: bool) -> None:
+    def draw(self, seen: Seen, visible: bool, names: bool = False) -> None:
+        """Update them.
+
+        Args:
+            seen: the skeletons.
+            visible: draw them.
+            names: with the name of each joint.
+        """
         drawn = figure(seen.skeletons if visible else (), self._colour)
+        self._which = drawn.which
+        self._draw_names(drawn.joints, names)
         colours: Any = STALE if seen.stale else drawn.joint_colours
         count = len(drawn.joints)
         self._joints.draw(drawn.joints, None, np.full((count, 3), self._radius), colour=colours)
@@ -50,14 +63,38 @@ class Drawn:
             self._lines.colors = np.array(colour, np.uint8)
         show(self._lines, bool(len(drawn.bones)))
 
+    def _draw_names(self, joints: FloatArray, everything: bool) -> None:
+        keys = [(int(place), int(number)) for place, number in self._which]
+        wanted = {key: at for key, at in zip(keys, joints, strict=True) if everything or key in self._named}
+        for key in self._labels.keys() - wanted.keys():
+            self._labels.pop(key).remove()
+        for key, at in wanted.items():
+            if key not in self._labels:
+                self._labels[key] = self._scene.add_label(
+                    f"{self._name}/names/{key[0]}_{key[1]}", joint_label(key[1]), anchor="bottom-center"
+                )
+            self._labels[key].position = at
+
+    def _on_click(self, index: int) -> None:
+        which = self._which
+        if index < len(which):
+            self._named ^= {(int(which[index, 0]), int(which[index, 1]))}
+
 
 class Shapes:
     """Any number of one mesh, each scaled, rotated and placed."""
 
     def __init__(
-        self, scene: viser.SceneApi, name: str, mesh: trimesh.Trimesh, colour: Colour, opacity: float | None = None
+        self,
+        scene: viser.SceneApi,
+        name: str,
+        mesh: trimesh.Trimesh,
+        colour: Colour,
+        opacity: float | None = None,
+        clicked: Callable[[int], None] | None = None,
     ) -> None:
         self._scene, self._name, self._mesh, self._colour, self._opacity = scene, name, mesh, colour, opacity
+        self._clicked = clicked
         self._room = 0
         self._handle: Any = None
 
@@ -114,6 +151,13 @@ class Shapes:
             cast_shadow=False,
             receive_shadow=False,
         )
+        if (clicked := self._clicked) is not None:
+
+            def on_click(event: viser.SceneNodePointerEvent[Any]) -> None:
+                if event.instance_index is not None:
+                    clicked(event.instance_index)
+
+            self._handle.on_click(on_click)
 
 
 def show(handle: Any, visible: bool) -> None:

@@ -6,12 +6,8 @@ All methods but :attr:`Page.watched` must be called from one thread; the server 
 from __future__ import annotations
 
 import html
-import socket
-import threading
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import redirect_stdout
-from io import StringIO
 from typing import Any, Final
 
 import numpy as np
@@ -27,7 +23,6 @@ from body_tracking.viewing.colours import (
     FILTERED,
     FUSED,
     INFERRED,
-    PALETTE,
     UNCERTAINTY,
     sensor_colours,
 )
@@ -35,7 +30,7 @@ from body_tracking.viewing.curves import AngleHistory
 from body_tracking.viewing.handles import BALL, STALE, TUBE, Drawn, Shapes, show
 from body_tracking.viewing.panel import ControlPanel
 from body_tracking.viewing.plots import Plots
-from body_tracking.viewing.same_origin import same_origin
+from body_tracking.viewing.server import address_of, serve, stop
 from body_tracking.viewing.shapes import (
     KINECT_VIEW,
     capsules,
@@ -44,15 +39,13 @@ from body_tracking.viewing.shapes import (
     in_world,
     with_legs,
 )
-from body_tracking.viewing.snapshot import Controls, Decode, PageError, Seen, Snapshot, SystemView
+from body_tracking.viewing.snapshot import Controls, Decode, Seen, Snapshot, SystemView
 from body_tracking.viewing.status import table
 
 _LAST_S: Final = 0.3
 """Seconds for the browsers to receive the last text."""
 WIDTH: Final = 290
 """Pixels of each panel beside the scene, so that it has 440 of a tablet's 1024."""
-_STOP_S: Final = 2.0
-"""Time limit for stopping the server, seconds."""
 
 _INITIAL_TARGET: Final = np.array([2.2, 0.0, 0.0])
 """Point at which the camera looks before a person is seen: in front of the reference sensor, metres in world."""
@@ -67,6 +60,7 @@ LAYERS: Final[Mapping[str, tuple[str, bool]]] = {
     "body": ("body", True),
     "uncertainty": ("95 % ellipsoids", False),
     "frames": ("frames of segments", False),
+    "names": ("names of joints", False),
     "floor": ("floor", True),
 }
 """Layers of the scene by name: label, and whether it is visible at first."""
@@ -105,9 +99,7 @@ class Page:
         layers: Sequence[Layer] = (),
         views: Sequence[SystemView] = (),
     ) -> None:
-        _check_address(host)
-        with same_origin(), redirect_stdout(StringIO()):  # viser prints a banner
-            self._server = viser.ViserServer(host, port, label="body_tracking", verbose=False)
+        self._server = serve(host, port)
         self._controls = controls
         self._choices = {**LAYERS, **{each.name: (each.text, each.shown) for each in layers}}
         for view in views:
@@ -125,8 +117,7 @@ class Page:
     @property
     def address(self) -> str:
         """URL of the page."""
-        host = self._server.get_host()
-        return f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
+        return address_of(self._server)
 
     @property
     def watched(self) -> int:
@@ -134,11 +125,8 @@ class Page:
         return len(self._server.get_clients())
 
     def close(self) -> None:
-        """Stop serving; a server that does not stop in time is abandoned, its threads are daemons."""
-        with redirect_stdout(StringIO()):
-            stopping = threading.Thread(target=self._server.stop, daemon=True)
-            stopping.start()
-            stopping.join(_STOP_S)
+        """Stop serving."""
+        stop(self._server)
 
     # --- the scene
 
@@ -210,7 +198,7 @@ class Page:
             others = (*(() if snapshot.fused.stale else snapshot.fused.skeletons), *standing)
             whole = tuple(with_legs(each, others) for each in snapshot.filtered.skeletons)
             filtered = Seen(whole, snapshot.filtered.stale)
-            self._drawn["filtered"].draw(filtered, self.visible["filtered"])
+            self._drawn["filtered"].draw(filtered, self.visible["filtered"], self.visible["names"])
             self._draw_body(filtered)
             self._draw_uncertainty(snapshot)
             self._draw_frames(snapshot)
@@ -270,10 +258,9 @@ class Page:
 
     def _panels(self, filters: Sequence[str], conventions: Sequence[str], window: float) -> None:
         gui = self._server.gui
-        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=PALETTE[0])
         gui.main_panel.dock_right()
         gui.main_panel.set_width(WIDTH)
-        self._panel = ControlPanel(self._server, self._controls, filters, conventions)
+        self._panel = ControlPanel(self._server, self._controls, filters, conventions, tuple(self._colours))
         self._legend = gui.add_html(self._legend_text())
         with gui.add_folder("Nodes"):
             self._table = gui.add_html("no diagnostics yet")
@@ -323,12 +310,3 @@ class Page:
     def draw_bodies(self, bodies: Sequence[str], chosen: str) -> None:
         """Update the list of persons with angles."""
         self._panel.draw_bodies(bodies, chosen)
-
-
-def _check_address(host: str) -> None:
-    """Refuse an address of another machine, for which viser would try port after port forever."""
-    try:
-        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
-            probe.bind((host, 0))
-    except OSError as error:
-        raise PageError(f"host {host!r}: cannot listen there ({error.strerror or error})") from error

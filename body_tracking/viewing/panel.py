@@ -11,6 +11,7 @@ import viser
 
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.messages.node_status import NodeStatus
+from body_tracking.pipeline.graph import END
 from body_tracking.viewing.handles import show
 from body_tracking.viewing.plots import NONE
 from body_tracking.viewing.snapshot import Controls
@@ -37,18 +38,25 @@ class ControlPanel:
         controls: called when a user presses a button or chooses an option.
         filters: options.
         conventions: options.
+        sensors: names of the sensors of skeletons.
     """
 
     def __init__(
-        self, server: viser.ViserServer, controls: Controls, filters: Sequence[str], conventions: Sequence[str]
+        self,
+        server: viser.ViserServer,
+        controls: Controls,
+        filters: Sequence[str],
+        conventions: Sequence[str],
+        sensors: Sequence[str] = (),
     ) -> None:
-        self._server, self._controls = server, controls
+        self._server, self._controls, self._sensors = server, controls, tuple(sensors)
         gui = server.gui
         self._state = gui.add_html(state_html({}, 0.0))
         self._groups: dict[str, list[Any]] = {}
         with gui.add_folder("Control"):
             for label, (node, services) in BUTTONS.items():
                 self._groups.setdefault(node, []).append(self._buttons(label, services))
+            self._end = self._buttons("graph", {"end": END})
             self._place: Any = gui.add_slider("time [s]", 0.0, 1.0, 0.1, 0.0, visible=False)
             self._loop: Any = gui.add_checkbox("loop", False, visible=False)
             self._groups[PLAYER] += [self._place, self._loop]
@@ -62,7 +70,8 @@ class ControlPanel:
 
     def draw(self, statuses: Mapping[str, NodeStatus], now: float, ended: bool) -> None:
         """Show the state, and what runs."""
-        self._state.content = state_html(statuses, now, ended)
+        self._state.content = state_html(statuses, now, ended, self._sensors)
+        show(self._end, not ended and self._controls.offers(END))
         there = {} if ended else fresh(statuses, now)
         for node, controls in self._groups.items():
             for each in controls:

@@ -56,11 +56,13 @@ class Figure:
 
     Attributes:
         joints: (n, 3) metres.
+        which: (n, 2) for each of them, the place of its skeleton and its number in :class:`Joint`.
         joint_colours: (n, 3) RGB.
         bones: (m, 2, 3) metres, their ends.
     """
 
     joints: FloatArray
+    which: IntArray
     joint_colours: ColourArray
     bones: FloatArray
 
@@ -158,12 +160,22 @@ def figure(skeletons: Sequence[Skeleton], own: Colour) -> Figure:
         own: the colour of tracked joints.
     """
     joints, colours, bones = [np.empty((0, 3))], [np.empty((0, 3), np.uint8)], [np.empty((0, 2, 3))]
-    for skeleton in skeletons:
+    which: list[IntArray] = [np.empty((0, 2), np.intp)]
+    for place, skeleton in enumerate(skeletons):
         placed = _placed(skeleton)
         joints.append(skeleton.positions[placed])
+        numbers = np.flatnonzero(placed)
+        which.append(np.stack([np.full_like(numbers, place), numbers], axis=1))
         colours.append(joint_colours(skeleton.states[placed], own))
         bones.append(_bones(skeleton, placed)[0])
-    return Figure(np.concatenate(joints), np.concatenate(colours), np.concatenate(bones))
+    return Figure(np.concatenate(joints), np.concatenate(which), np.concatenate(colours), np.concatenate(bones))
+
+
+def joint_label(number: int) -> str:
+    """A joint in words: ``left elbow``."""
+    words = Joint(number).name.lower().split("_")
+    sides = [word for word in words if word in ("left", "right")]
+    return " ".join([*sides, *(word for word in words if word not in sides)])
 
 
 def capsules(skeletons: Sequence[Skeleton]) -> Capsules:

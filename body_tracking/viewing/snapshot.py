@@ -26,6 +26,9 @@ class Controls(Protocol):
     def call(self, service: str) -> str:
         """Call a ``std_srvs/Trigger``."""
 
+    def offers(self, service: str) -> bool:
+        """Whether a node offers this service; returns at once."""
+
     def seek(self, place_s: float) -> str:
         """Continue the bag at this place, seconds from its beginning."""
 

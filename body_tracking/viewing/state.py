@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -11,10 +11,14 @@ from body_tracking.messages.node_status import NodeStatus
 from body_tracking.viewing.status import FRESH
 
 PLAYER, RECORDER, CALIBRATION = "bag_player", "bag_recorder", "calibration"
-_RED, _GREEN, _ORANGE, _GREY = "#e03131", "#2f9e44", "#f08c00", "#868e96"
+RED, GREEN, ORANGE, GREY = "#e03131", "#2f9e44", "#f08c00", "#868e96"
 _ENDED: Final = (
     "The graph has ended; nothing here answers any more. Start it again, and this page comes back by itself: "
     "<code>body_tracking up --viewer</code>, or with <code>--bag BAG</code> to play a recording."
+)
+
+_NOTHING: Final = (
+    "look at its cable and its program, and whether it publishes in this ROS domain (<code>body_tracking doctor</code>)"
 )
 
 
@@ -23,25 +27,26 @@ def fresh(statuses: Mapping[str, NodeStatus], now: float) -> dict[str, NodeStatu
     return {name: status for name, status in statuses.items() if now - status.received <= FRESH}
 
 
-def state_html(statuses: Mapping[str, NodeStatus], now: float, ended: bool = False) -> str:
+def state_html(statuses: Mapping[str, NodeStatus], now: float, ended: bool = False, sensors: Sequence[str] = ()) -> str:
     """The state as HTML.
 
     Args:
         statuses: by node name.
         now: steady time, seconds.
         ended: the graph has ended.
+        sensors: names of the sensors of skeletons.
     """
     there = {} if ended else fresh(statuses, now)
     if ended or (statuses and not there):
-        return _block([_line(_RED, "ended", _ENDED)])
+        return block([line(RED, "ended", _ENDED)])
     if not there:
-        return _block([_line(_ORANGE, "waiting", "no node has reported yet")])
-    lines = [*_input(there), _calibration(there), _recording(there)]
-    return _block([line for line in lines if line])
+        return block([line(ORANGE, "waiting", "no node has reported yet")])
+    lines = [*_input(there, sensors), _calibration(there), _recording(there)]
+    return block([each for each in lines if each])
 
 
-def _input(there: Mapping[str, NodeStatus]) -> list[str]:
-    """The bag that plays, and the rate of each sensor."""
+def _input(there: Mapping[str, NodeStatus], sensors: Sequence[str]) -> list[str]:
+    """The bag that plays, and the rate of each sensor; with a bag, none that is not in it."""
     lines = []
     if (player := there.get(PLAYER)) is not None:
         bag = Path(player.values.get("bag", "")).name
@@ -49,8 +54,8 @@ def _input(there: Mapping[str, NodeStatus]) -> list[str]:
         again = ", again and again" if player.values.get("loop") == "True" else ""
         playing = player.text == "playing"
         words = f"<b>{html.escape(bag)}</b>, {position:.1f} of {duration:.1f} s{again}"
-        lines.append(_line(_GREEN if playing else _ORANGE, html.escape(player.text), words))
-    rates: dict[str, float] = {}
+        lines.append(line(GREEN if playing else ORANGE, html.escape(player.text), words))
+    rates: dict[str, float] = {} if PLAYER in there else dict.fromkeys(sensors, 0.0)
     for status in there.values():
         for key in status.values:
             if key.startswith("rate in ") and key.endswith("/skeleton"):
@@ -60,8 +65,10 @@ def _input(there: Mapping[str, NodeStatus]) -> list[str]:
                     rates[sensor] = max(rate, rates.get(sensor, 0.0))
     if rates:
         words = ", ".join(f"{html.escape(sensor)} {rate:.0f} Hz" for sensor, rate in sorted(rates.items()))
-        colour = _GREEN if all(rates.values()) else _ORANGE
-        lines.append(_line(colour, "sensors", words))
+        silent = [html.escape(sensor) for sensor, rate in sorted(rates.items()) if not rate]
+        if silent and (player is None or player.text == "playing"):
+            words += f". <b>Nothing comes from {' and '.join(silent)}</b>: {_NOTHING}"
+        lines.append(line(ORANGE if silent else GREEN, "sensors", words))
     return lines
 
 
@@ -84,9 +91,9 @@ def _calibration(there: Mapping[str, NodeStatus]) -> str:
     elif known:
         todo = "done; start again after a sensor has moved"
     else:
-        return _line(_GREEN, "calibration", html.escape(status.text))
+        return line(GREEN, "calibration", html.escape(status.text))
     text = f"{html.escape(status.text)}{': ' if known else ''}{', '.join(known)} ({todo})"
-    return _line(_ORANGE if status.level else _GREEN, "calibration", text)
+    return line(ORANGE if status.level else GREEN, "calibration", text)
 
 
 def _recording(there: Mapping[str, NodeStatus]) -> str:
@@ -97,13 +104,15 @@ def _recording(there: Mapping[str, NodeStatus]) -> str:
     folder, messages = status.values.get("bag", ""), status.number("messages") or 0.0
     if status.text == "recording":
         where = html.escape(folder) if folder not in ("", "None") else "a new folder"
-        return _line(_RED, "REC", f"<b>recording into {where}</b>, {messages:.0f} messages")
-    return _line(_RED if status.level == 2 else _GREY, "recording", html.escape(status.text))
+        return line(RED, "REC", f"<b>recording into {where}</b>, {messages:.0f} messages")
+    return line(RED if status.level == 2 else GREY, "recording", html.escape(status.text))
 
 
-def _line(colour: str, what: str, text: str) -> str:
+def line(colour: str, what: str, text: str) -> str:
+    """A line of the page: a dot, a word in bold, and a text in HTML."""
     return f"<div><span style='color:{colour}'>&#9679; <b>{what}</b></span> {text}</div>"
 
 
-def _block(lines: list[str]) -> str:
+def block(lines: list[str]) -> str:
+    """Lines in small type."""
     return f"<div style='font-size:0.8em;line-height:1.35;padding:0.3em 0.6em'>{''.join(lines)}</div>"

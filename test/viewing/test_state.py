@@ -40,6 +40,15 @@ def test_the_rate_of_each_sensor_is_there_but_of_no_estimate() -> None:
     assert "kinect1 30 Hz" in text and "fused" not in text
 
 
+def test_a_sensor_that_sends_nothing_is_named() -> None:
+    rates = {"rate in /a/skeleton": "0.0", "rate in /b/skeleton": "30.0"}
+    fusion = {"fusion": NodeStatus("fusion: stream", 0, "OK", rates)}
+    assert "Nothing comes from a</b>" in state_html(fusion, 0.0)
+    assert "Nothing comes from a and c</b>" in state_html(fusion, 0.0, sensors=("a", "b", "c"))
+    paused = {**fusion, "bag_player": NodeStatus("bag_player: stream", 0, "paused", PLAYER)}
+    assert "Nothing comes" not in state_html(paused, 0.0, sensors=("a", "b", "c"))
+
+
 def test_an_end_is_said_and_what_to_do_then() -> None:
     running = {"fusion": NodeStatus("fusion: stream", 0, "OK", {}, 10.0)}
     assert "has ended" not in state_html(running, 10.5)

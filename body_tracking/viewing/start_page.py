@@ -1,0 +1,170 @@
+"""The page before a graph runs: recordings and sensors to choose from, and what else is in the ROS domain."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Self
+
+import viser
+
+from body_tracking.viewing.server import address_of, serve, stop
+from body_tracking.viewing.state import GREEN, GREY, ORANGE, RED, block, line
+
+DEFAULT: Final = "default"
+"""The filter that a graph has where none is chosen."""
+_LEFT, _RIGHT = 540, 380
+"""Pixels of the panels: both fit a tablet of 1024."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """A recording to choose.
+
+    Attributes:
+        path: of the bag.
+        where: in words, such as "in this folder".
+        content: its length and sensors in words.
+        refusal: why it cannot be played as it is; empty where it can.
+    """
+
+    path: Path
+    where: str
+    content: str
+    refusal: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """What the user has chosen.
+
+    Attributes:
+        bag: to play; None for the sensors that publish.
+        loop: play it again and again.
+        filter: a name, or :data:`DEFAULT`.
+    """
+
+    bag: Path | None
+    loop: bool
+    filter: str
+
+
+class StartPage:
+    """Serves the page until it is closed; its methods must be called from one thread.
+
+    Args:
+        host: address to listen on.
+        port: the first one to try.
+        filters: options.
+        choose: called with the user's choice, in a thread of the server.
+
+    Raises:
+        PageError: as of :func:`serve`.
+    """
+
+    def __init__(self, host: str, port: int, filters: Sequence[str], choose: Callable[[Choice], None]) -> None:
+        self._choose = choose
+        self._server = serve(host, port)
+        scene, gui = self._server.scene, self._server.gui
+        scene.set_up_direction("+z")
+        scene.add_grid("/floor", 12.0, 12.0, cell_color=(228, 230, 234), section_color=(205, 209, 215))
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(_RIGHT)
+        self._state = gui.add_html("")
+        self.say("Choose a recording on the left, or start with sensors.", GREEN)
+        with gui.add_folder("Sensors"):
+            self._sensors = gui.add_html("")
+            self._start: Any = gui.add_button("start with these sensors", visible=False)
+        with gui.add_folder("How"):
+            self._filter: Any = gui.add_dropdown("filter", (DEFAULT, *filters))
+            self._loop: Any = gui.add_checkbox("loop", False, hint="play the recording again at its end")
+        with gui.add_folder("Nodes"):
+            self._nodes = gui.add_html("")
+        self._start.on_click(lambda _: self._choose(self._choice(None)))
+        panel = gui.add_panel()
+        self._recordings = panel.add_tab("Recordings", viser.Icon.PLAYER_PLAY)
+        with self._recordings:
+            self._path: Any = gui.add_text("open", "", hint="a recording elsewhere: its folder, or its mcap file")
+            self._open: Any = gui.add_button("open this recording")
+        self._open.on_click(lambda _: self._on_open())
+        self._listed: tuple[Recording, ...] = ()
+        self._parts: list[Any] = []
+        panel.dock_left()
+        panel.set_width(_LEFT)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._server.flush()
+        stop(self._server)
+
+    @property
+    def address(self) -> str:
+        """URL of the page."""
+        return address_of(self._server)
+
+    @property
+    def port(self) -> int:
+        """The one that it has got."""
+        return int(self._server.get_port())
+
+    def say(self, text: str, colour: str) -> None:
+        """Show a line at the top."""
+        word = {RED: "failed", GREEN: "ready", ORANGE: "wait"}.get(colour, "")
+        self._state.content = block([line(colour, word, html.escape(text))])
+
+    def draw_recordings(self, recordings: Sequence[Recording]) -> None:
+        """Show the recordings, those that can be played with a button."""
+        if tuple(recordings) == self._listed:
+            return
+        self._listed = tuple(recordings)
+        gui = self._server.gui
+        with self._server.atomic(), self._recordings:
+            for part in self._parts:
+                part.remove()
+            self._parts = []
+            for each in self._listed:
+                said = f"{html.escape(each.where)}: {html.escape(each.content)}"
+                if each.refusal:
+                    name = f"<b>{html.escape(each.path.name)}</b> {said}"
+                    self._parts.append(gui.add_html(block([line(GREY, "", f"{name}. {html.escape(each.refusal)}")])))
+                    continue
+                button: Any = gui.add_button(f"play {each.path.name}")
+                button.on_click(lambda _, path=each.path: self._choose(self._choice(path)))
+                self._parts += [button, gui.add_html(block([said]))]
+            if not self._listed:
+                self._parts.append(gui.add_html(block([line(ORANGE, "none", "no recordings here")])))
+
+    def draw_domain(self, sensors: str, nodes: Sequence[str], runs: bool, absent: str) -> None:
+        """Show what is in the ROS domain.
+
+        Args:
+            sensors: that publish, in words; empty for none.
+            nodes: their names.
+            runs: whether a graph runs already.
+            absent: what to say where no sensor publishes.
+        """
+        words = line(GREEN, "publish", html.escape(sensors)) if sensors else line(ORANGE, "none", html.escape(absent))
+        self._set(self._sensors, block([words]))
+        if self._start.visible != bool(sensors and not runs):
+            self._start.visible = bool(sensors and not runs)
+        lines = [html.escape(name) for name in nodes] or ["none"]
+        if runs:
+            text = "a graph of <code>body_tracking up</code> runs already; end it before you start another one here"
+            lines.insert(0, line(ORANGE, "runs", text))
+        self._set(self._nodes, block([f"<div>{each}</div>" for each in lines]))
+
+    @staticmethod
+    def _set(part: Any, content: str) -> None:
+        if part.content != content:
+            part.content = content
+
+    def _choice(self, bag: Path | None) -> Choice:
+        return Choice(bag, bool(self._loop.value), str(self._filter.value))
+
+    def _on_open(self) -> None:
+        if self._path.value.strip():
+            self._choose(self._choice(Path(self._path.value.strip()).expanduser()))
