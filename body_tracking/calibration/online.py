@@ -77,6 +77,9 @@ CLOCK_STEP = 1.0
 CLOCK_WINDOW = 3.0
 """Half width of the search for the clock offset around the guess by the times of receipt, seconds."""
 
+RECEIPT_EXCLUDES = 2.0 * RECEIPT_PRIOR
+"""Difference from the clock by times of receipt beyond which the best correlation's offset replaces it, seconds."""
+
 CLOCK_CORRELATION, CLOCK_MARGIN = 0.6, 0.08
 """Least correlation of the joint speeds at the clock offset, and least difference to every other offset's."""
 
@@ -478,8 +481,10 @@ class OnlineCalibration:
             self._drop_saved_clock(name, other)
         other.clock_locked = True
         other.movement_since = self._now
-        self.events.append(f"{name}: clock offset {other.clock_base.offset:+.2f} s found from the motion")
-        if other.clock_expected is None:
+        # A few seconds of a twist seen from its side give an offset that is up to 60 ms wrong. One that the times of
+        # receipt do not exclude is left to the fit, which weighs both.
+        if other.clock_expected is None and abs(found.offset) > RECEIPT_EXCLUDES:
+            self.events.append(f"{name}: clock offset {other.clock_base.offset:+.2f} s found from the motion")
             other.clock = other.clock_base
             self._pair_anew(other, horizon)  # the pairs so far were made with the guess
         # Windows lie on multiples of their length, whenever the clock was found.
