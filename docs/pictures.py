@@ -49,10 +49,20 @@ VIEWS = {
 }
 MOVING = {
     "trunk": ("lumbar",), "shoulder": ("shoulder",), "humeral": ("shoulder",), "elbow": ("elbow",),
-    "clavicle": ("clavicle_elevation",),
+    "clavicle": ("clavicle_elevation",), "neck": ("neck",),
 }  # fmt: skip
-"""Beginning of an angle's name in ``positional``: that of the coordinates that move it in the pictures."""
-CONVENTIONS = ("model", "isb", "positional")
+"""Beginning of an angle's name or kind in ``positional`` and ``rep155``: that of the coordinates that move it in the
+pictures."""
+CONVENTIONS = ("model", "isb", "positional", "rep155", "dh26")
+KINDS = {
+    "waist": "trunk", "r_head": "neck", "p_head": "neck", "l_y_shoulder": "shoulder_plane",
+    "l_p_shoulder": "shoulder", "l_r_shoulder": "shoulder_rotation", "l_elbow": "elbow",
+    **{f"theta{number}": "trunk" for number in range(1, 7)}, "theta7": "clavicle", "theta8": "clavicle",
+    "theta13": "shoulder", "theta14": "shoulder", "theta15": "shoulder_rotation", "theta17": "elbow",
+    "theta18": "wrist", "theta19": "wrist",
+}  # fmt: skip
+"""What moves, of angles whose names do not say it: those of the trunk and the left side. Without
+``y_head``, which moves no point, and theta9 and theta16, which are redundant."""
 
 
 def points(q: Array) -> Array:
@@ -83,6 +93,7 @@ def pose(**degrees: float) -> Array:
 
 def start(name: str) -> Array:
     """A pose in which the angle is not singular, and shows."""
+    name = KINDS.get(name, name)
     out = {"shoulder_x_left": 35.0, "shoulder_x_right": -35.0}
     if "plane" in name:
         return pose(shoulder_x_left=70.0, shoulder_x_right=-35.0)
@@ -98,8 +109,10 @@ def start(name: str) -> Array:
 def moved(q: Array, name: str, convention: str, by: float) -> Array:
     """The pose in which the angle is larger by this many radians, and all others of the convention are as they were."""
     names = angle_names(convention)
-    # positions determine fewer angles than the model has: what moves is the joint that the name says
-    moving = next((words for words in MOVING if convention == "positional" and name.startswith(words)), None)
+    # these conventions have fewer angles than the model: what moves is the joint that the name says
+    kind = KINDS.get(name, name)
+    few = convention in ("positional", "rep155")
+    moving = next((words for words in MOVING if few and kind.startswith(words)), None)
     columns = [k for k in range(6, MODEL.nv) if moving is None or MODEL.coordinate_names[k].startswith(MOVING[moving])]
     want = angles(q, convention)
     kept = np.isfinite(want)
@@ -140,7 +153,8 @@ def draw(axes: Axes, at: Array, view: str, colour: str | None, width: float) -> 
 def panel(axes: Axes, name: str, convention: str) -> None:
     """One angle: the pose before in grey, the pose with a larger angle in colour, and how the farthest point moves."""
     before = start(name)
-    small = any(word in name for word in ("clavicle", "wrist", "neck", "lumbar", "thoracic", "thorax", "trunk"))
+    kind = KINDS.get(name, name)
+    small = any(word in kind for word in ("clavicle", "wrist", "neck", "lumbar", "thoracic", "thorax", "trunk"))
     by = np.radians(22.0 if small else 35.0)
     path = [before]
     for _ in range(3):
@@ -149,7 +163,7 @@ def panel(axes: Axes, name: str, convention: str) -> None:
     travel = np.linalg.norm(track[-1] - track[0], axis=1)
     farthest = int(np.nanargmax(travel))
     along = track[-1, farthest] - track[0, farthest]
-    choice = [v for v in VIEWS if v != "from the front" or not name.startswith("wrist")]
+    choice = [v for v in VIEWS if v != "from the front" or not kind.startswith("wrist")]
     view = min(choice, key=lambda v: (abs(float(along @ np.array(VIEWS[v][0]))), v))
     draw(axes, track[0], view, GREY, 2.5)
     draw(axes, track[-1], view, None, 2.0)
@@ -161,12 +175,12 @@ def panel(axes: Axes, name: str, convention: str) -> None:
     axes.text(0.5, -0.02, view, transform=axes.transAxes, ha="center", va="top", fontsize=7, color="#666666")
     axes.set_aspect("equal")
     half, middle = 1.0, np.array([0.0, 0.0] if view == "from above" else [0.0, 0.2])
-    if name.startswith(("wrist", "forearm", "elbow_pronation", "neck", "clavicle")):  # closer
-        half = 0.25 if not name.startswith("clavicle") else 0.5
+    if kind.startswith(("wrist", "forearm", "elbow_pronation", "neck", "clavicle")):  # closer
+        half = 0.25 if not kind.startswith("clavicle") else 0.5 if convention != "dh26" else 1.0
         seen = track[
-            0, Joint.HEAD if "neck" in name else Joint.SHOULDER_LEFT if "clavicle" in name else Joint.WRIST_LEFT
+            0, Joint.HEAD if "neck" in kind else Joint.SHOULDER_LEFT if "clavicle" in kind else Joint.WRIST_LEFT
         ]
-        middle = np.array([seen @ right, seen @ up])
+        middle = np.array([seen @ right, seen @ up]) if half < 1.0 else middle
     axes.set_xlim(middle[0] - half, middle[0] + half)
     axes.set_ylim(middle[1] - 0.8 * half, middle[1] + 0.8 * half)
     axes.axis("off")
@@ -174,6 +188,8 @@ def panel(axes: Axes, name: str, convention: str) -> None:
 
 def drawn(convention: str) -> list[str]:
     """The angles that are drawn: those of the trunk, and the left ones."""
+    if convention in ("rep155", "dh26"):
+        return [name for name in angle_names(convention) if name in KINDS]
     return [name for name in angle_names(convention) if not name.endswith("_right") or name.endswith("lateral_right")]
 
 
