@@ -89,6 +89,7 @@ BENCHMARKS = {
     "markers_wand": Benchmark(1),
     "markers_time": Benchmark(2),
     "markers_reference": Benchmark(6),
+    "startup": Benchmark(2),
     "latency": Benchmark(1),
     "four_sensors": Benchmark(1),
     "imu_live": Benchmark(2),
