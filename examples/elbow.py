@@ -1,6 +1,9 @@
 """Print the left elbow of the person as a controller would take it: only while it is certain enough."""
 
+from contextlib import suppress
+
 import rclpy
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
@@ -29,4 +32,5 @@ class Elbow(Node):
 
 
 rclpy.init()
-rclpy.spin(Elbow())
+with suppress(ExternalShutdownException, KeyboardInterrupt):  # kill, Ctrl-C
+    rclpy.spin(Elbow())

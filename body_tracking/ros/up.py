@@ -133,7 +133,7 @@ def options_for(args: argparse.Namespace, found: Mapping[str, Value] = MappingPr
             duration = (reader.end_ns - reader.start_ns) / NANOSECONDS
         if args.start and not 0.0 < args.start < duration:
             raise UpError(f"start {args.start:g}: the bag lasts {duration:.1f} s")
-        if not there and not names_sensors(given) and args.params_file is None:
+        if not there and not names_sensors({**given, **_in_file(args.params_file)}):
             given |= found_sensors(types)
         if not options_of(**given)["computed"]:
             given.setdefault("sensors", there)
@@ -151,6 +151,11 @@ def options_for(args: argparse.Namespace, found: Mapping[str, Value] = MappingPr
         if not options["played"]:
             raise UpError(f"{args.bag}: no topic /<sensor>/skeleton; it has {', '.join(sorted(topics)) or 'none'}")
     return options
+
+
+def _in_file(file: Path | None) -> dict[str, Value]:
+    """The options that a parameters file sets."""
+    return {name: value for name, value in with_file(options_of(), file).items() if value != OPTIONS[name].default}
 
 
 def all_parameters(

@@ -47,9 +47,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "there runs as with body_tracking up, and the page shows it; at its end the list is back. Ends with Ctrl-C.",
         epilog="The options hold for all that is started from the page.",
     )
-    parser.add_argument(
-        "folder", type=Path, nargs="?", default=Path(), help="whose recordings are listed (default: this folder)"
-    )
     add_options(parser, *(name for name, each in OPTIONS.items() if not each.hidden and name not in _NOT_HERE))
     parser.add_argument("--log-dir", type=Path, metavar="FOLDER", help="folder for logs (default: that of ROS)")
     parser.set_defaults(run=run)
@@ -57,8 +54,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """``body_tracking view``."""
-    if not args.folder.is_dir():
-        raise UpError(f"{args.folder}: no such folder")
     dds.stay_on_this_machine()
     dds.prepare()
     try:
@@ -159,7 +154,7 @@ def _absent() -> str:
 def _recordings(args: argparse.Namespace, known: dict[Path, Any]) -> Iterator[Any]:
     """The recordings of the folder, then those that come with the package, each once."""
     seen: set[Path] = set()
-    for where, bags in (("in this folder", bags_in(args.folder)), ("an example", shipped_bags())):
+    for where, bags in (("in this folder", bags_in(Path())), ("an example", shipped_bags())):
         for bag in bags:
             path = bag.resolve()
             if path in seen:
@@ -178,7 +173,7 @@ def _described(args: argparse.Namespace, bag: Path, where: str) -> Any:
         with RigReader(bag) as reader:
             length = f"{(reader.end_ns - reader.start_ns) / NANOSECONDS:.1f} s"
     except BodyTrackingError as error:
-        return Recording(bag, where, "cannot be read", str(error))
+        return Recording(bag, where, "cannot be read", str(error).replace(f"{bag}/", ""))
     try:
         options = options_for(_graph(args, Choice(bag, False, DEFAULT)))
     except BodyTrackingError as error:

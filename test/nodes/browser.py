@@ -7,7 +7,7 @@ import re
 import shutil
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,18 @@ JOINTS = """name => {
   return Array.from(new Float32Array(bytes.buffer, bytes.byteOffset, bytes.byteLength / 4));
 }"""
 
+
+OUT_OF_REACH = """roles => roles.flatMap(role => Array.from(document.querySelectorAll(role))).filter(each => {
+  each.scrollIntoView({block: "center"});
+  const box = each.getBoundingClientRect();
+  if (!box.width || !box.height || each.closest("[inert]")) return false;
+  const [x, y] = [box.x + box.width / 2, box.y + box.height / 2];
+  if (x < 0 || y < 0 || x >= innerWidth || y >= innerHeight) return true;
+  const hit = document.elementFromPoint(x, y);
+  if (hit?.closest(".mantine-Notification-root")) return false;
+  return !hit || !(each.contains(hit) || hit.contains(each) || each.parentElement.contains(hit));
+}).map(each => each.innerText || each.outerHTML.slice(0, 200))"""
+"""The visible elements of these selectors whose middle is outside of the window, or under anything but a note."""
 
 _PIXELS = """() => Array.from(document.querySelectorAll("img")).filter(each => each.naturalWidth > 300).map(each => {
   const canvas = document.createElement("canvas");
@@ -66,14 +78,14 @@ def need_chromium() -> None:
 class Browser:
     """A page and the graph that it shows, whose filtered skeletons are received in a thread of their own."""
 
-    def __init__(self, running: Running, page: Any, clouds: list[Any]) -> None:
-        self.running, self.page, self.clouds = running, page, clouds
+    def __init__(self, running: Running, page: Any, clouds: list[Any], name: str = "viewer") -> None:
+        self.running, self.page, self.clouds, self.name = running, page, clouds, name
 
     def until(self, condition: Callable[[], Any], what: str) -> Any:
         """Wait for a condition; a timeout fails the test."""
         end = time.monotonic() + PATIENCE
         while not (found := condition()):
-            assert time.monotonic() < end, f"waited {PATIENCE} s for: {what}\n{self.running.log('viewer')}"
+            assert time.monotonic() < end, f"waited {PATIENCE} s for: {what}\n{self.running.log(self.name)}"
             self.page.wait_for_timeout(100)
         return found
 
@@ -94,25 +106,48 @@ class Browser:
         texts = self.page.locator("[role=alert], .mantine-Notification-root").all_inner_texts()
         return next((text for text in texts if pattern.search(text) and "waits for an answer" not in text), "")
 
+    def text(self) -> str:
+        """All words on the page."""
+        return str(self.page.inner_text("body"))
+
+    def reads(self, pattern: str) -> None:
+        """Wait until the page says so."""
+        self.until(lambda: re.search(pattern, self.text()), f"{pattern!r} on the page")
+
+    def out_of_reach(self, *roles: str) -> list[str]:
+        """The controls that a finger cannot get at, after scrolling to them."""
+        self.close_notes()
+        return [str(each) for each in self.page.evaluate(OUT_OF_REACH, list(roles))]
+
+    def close_notes(self) -> None:
+        """Close all notifications."""
+        for note in self.page.locator(".mantine-Notification-closeButton").all():
+            with suppress(Exception):  # it may close by itself meanwhile
+                note.dispatch_event("click", timeout=1e3)
+
     def picture(self) -> bytes:
         """The middle of the scene, where the person stands."""
         size = self.page.viewport_size
         clip = {"x": 0.42 * size["width"], "y": 0.3 * size["height"], "width": 0.2 * size["width"], "height": 200}
         return bytes(self.page.screenshot(clip=clip, timeout=1e3 * PATIENCE))
 
-    def save(self, name: str) -> None:
-        """A picture for the documentation, if these are asked for."""
+    def save(self, name: str, height: int | None = None) -> None:
+        """A picture for the documentation, if these are asked for: of the page, or the top of its right panel."""
         if PICTURES:
             file = Path(PICTURES) / name
             file.parent.mkdir(parents=True, exist_ok=True)
-            for note in self.page.locator(".mantine-Notification-closeButton").all():
-                note.dispatch_event("click")
+            self.close_notes()
             self.page.wait_for_timeout(5e3)
-            self.page.screenshot(path=file, timeout=1e3 * PATIENCE)
+            size = self.page.viewport_size
+            panel = {"x": size["width"] - 292, "y": 56, "width": 292, "height": height or 0}
+            whole: dict[str, Any] = {} if height is None else {"clip": panel}
+            self.page.screenshot(path=file, timeout=1e3 * PATIENCE, **whole)
 
 
 @contextmanager
-def browsing(running: Running, folder: Path, size: tuple[int, int], sharpness: float) -> Iterator[Any]:
+def browsing(
+    running: Running, folder: Path, size: tuple[int, int], sharpness: float, name: str = "viewer"
+) -> Iterator[Any]:
     """The page of a running viewer, in playwright.
 
     Args:
@@ -120,14 +155,15 @@ def browsing(running: Running, folder: Path, size: tuple[int, int], sharpness: f
         folder: for temporary files.
         size: of the window, pixels.
         sharpness: pixels that are drawn per pixel of the window.
+        name: of the process that serves the page.
     """
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
     def opened() -> bool:
-        return (running.folder / "viewer.log").exists() and "open http" in running.log("viewer")
+        return (running.folder / f"{name}.log").exists() and "open http" in running.log(name)
 
-    assert running.until(opened, PATIENCE), running.log("viewer")
-    address = re.search(r"http://\S+", running.log("viewer"))
+    assert running.until(opened, PATIENCE), running.log(name)
+    address = re.search(r"http://\S+", running.log(name))
     assert address is not None and address[0].startswith("http://127.0.0.1:")
     with playwright.sync_playwright() as driver:
         # Software draws as fast as it can; what it draws comes first.

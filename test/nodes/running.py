@@ -151,12 +151,16 @@ class Running:
         words = words_of(parameters, name)
         return self.start_module(name or executable, "body_tracking.nodes", executable, "--ros-args", *words)
 
-    def start_module(self, name: str, module: str, *words: str | Path) -> subprocess.Popen[bytes]:
-        """Start what ``python -m`` does; its output goes to a file."""
+    def start_module(
+        self, name: str, module: str, *words: str | Path, folder: Path | None = None
+    ) -> subprocess.Popen[bytes]:
+        """Start what ``python -m`` does, in a folder; its output goes to a file."""
         variables = {**self.environment, PARENT_VARIABLE: str(os.getpid())}  # no node outlives the tests
+        if folder is not None:
+            variables["PYTHONPATH"] = str(ROOT)
         with (self.folder / f"{name}.log").open("wb") as log:
             self.processes[name] = process = subprocess.Popen(
-                [sys.executable, "-m", module, *words], stdout=log, stderr=subprocess.STDOUT, env=variables
+                [sys.executable, "-m", module, *words], stdout=log, stderr=subprocess.STDOUT, env=variables, cwd=folder
             )
         return process
 
