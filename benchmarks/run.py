@@ -64,6 +64,8 @@ BENCHMARKS = {
     "baseline": Benchmark(4),
     "depth_images": Benchmark(1, MAKEHUMAN),
     "camera_skeleton": Benchmark(10, MAKEHUMAN),
+    "camera_accuracy": Benchmark(20, MAKEHUMAN),
+    "camera_live": Benchmark(2),
     "camera_photographs": Benchmark(1, recordings("kinect_depth")),
     "mesh_fit": Benchmark(10, MAKEHUMAN),
     "mesh_hidden": Benchmark(8, MAKEHUMAN),

