@@ -25,6 +25,7 @@ from body_tracking.filters.ekf import sources as orientation
 from body_tracking.filters.ekf.filter import ExtendedKalmanFilter, prepare
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.sources import PER_SOURCE, Sources
+from body_tracking.kinematics.posture import STDDEV
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UNOBSERVED
 from body_tracking.simulation.random_people import (
@@ -363,7 +364,7 @@ def still(posture: dict[str, float], seconds: float, until: dict[str, float] | N
 
 
 def test_how_somebody_stands_is_no_error_of_the_sources() -> None:
-    """The prior at the middle of a range has the same error each time, and is applied rarely (before: 13 degrees)."""
+    """A prior has the same error each time, and must not turn segments that are measured (before: 13 degrees)."""
     posture = {"lumbar_flexion": 30.0, "thoracic_flexion": 15.0, "lumbar_axial": 12.0, "clavicle_elevation_left": 20.0}
     estimator = ExtendedKalmanFilter()
     events = still(posture, 12.0)
@@ -374,6 +375,26 @@ def test_how_somebody_stands_is_no_error_of_the_sources() -> None:
     for segment, rotation in said.items():
         off = so3.rotation_vectors(rotation.T @ found[SEGMENT_NUMBER[segment]])
         assert np.linalg.norm(off) < np.radians(6.0), segment
+
+
+def test_posture_shares_a_bend_between_measured_segments_and_does_not_turn_these() -> None:
+    """Pelvis and chest are measured: the prior decides how lumbar and thoracic joints share what is between them."""
+    events = [
+        each
+        for each in still({"lumbar_flexion": 30.0, "thoracic_flexion": 0.0}, 4.0)
+        if each.segment in ("pelvis", "upper_trunk")
+    ]
+    estimator = ExtendedKalmanFilter()
+    feed(estimator, events)
+    q = known(estimator).q
+    found = MODEL.forward(q, MODEL.default_lengths()).rotations
+    for each in events[-2:]:
+        off = so3.rotation_vectors(each.rotation.T @ found[SEGMENT_NUMBER[each.segment]])
+        assert np.linalg.norm(off) < np.radians(2.0), each.segment
+    flexion = {name: q[MODEL.scalar_q[MODEL.scalar_v == NAMES.index(name)][0]] for name in NAMES if "flexion" in name}
+    lumbar, thoracic = (STDDEV[f"{part}_flexion"] ** 2 for part in ("lumbar", "thoracic"))
+    share = flexion["lumbar_flexion"] / (flexion["lumbar_flexion"] + flexion["thoracic_flexion"])
+    assert abs(share - lumbar / (lumbar + thoracic)) < 0.1
 
 
 def test_what_a_silent_source_said_no_more_is_bounded_by_the_ranges() -> None:

@@ -108,7 +108,7 @@ class ExtendedKalmanFilter:
             self.counters,
         )
         self._facing = Facing(space, self.counters)
-        self._output = Output(space, self._displacement, p)
+        self._output = Output(space, self._displacement, self._priors, p)
         self._smoother = Smoother(space, self._motion)
         self.reset()
 

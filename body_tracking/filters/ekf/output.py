@@ -9,7 +9,7 @@ from body_tracking.core.skeleton import N_JOINTS, FloatArray, Skeleton, Tracking
 from body_tracking.filters.ekf import kernels
 from body_tracking.filters.ekf.displacement import Displacement
 from body_tracking.filters.ekf.parameters import EkfParameters
-from body_tracking.filters.ekf.priors import VAGUE
+from body_tracking.filters.ekf.priors import VAGUE, Priors
 from body_tracking.filters.ekf.state import State, StateSpace
 
 _INFERRED = np.uint8(TrackingState.INFERRED)
@@ -24,12 +24,15 @@ class Output:
     Args:
         space: of the states.
         displacement: of the filter.
+        priors: of the filter.
         parameters: of the filter.
     """
 
-    def __init__(self, space: StateSpace, displacement: Displacement, parameters: EkfParameters) -> None:
+    def __init__(
+        self, space: StateSpace, displacement: Displacement, priors: Priors, parameters: EkfParameters
+    ) -> None:
         self._space, self._model, self._ranges = space, space.model, space.ranges
-        self._displacement, self._parameters = displacement, parameters
+        self._displacement, self._priors, self._parameters = displacement, priors, parameters
         names = space.model.coordinate_names[6:]
         self._twists = np.array([name.startswith(("shoulder_z", "forearm_pronation")) for name in names])
         self._postural = np.flatnonzero(np.append(space.prior.postural, [True] * 3))
@@ -45,7 +48,7 @@ class Output:
 
         The filter follows the joints where sensors take them to be. What it cannot know, how far these are from the
         anatomical ones, is added here; and of both together posture decides (``kinematics.posture``): an iterated
-        update by the prior, once for each output and never fed back.
+        update by the prior, once for each output and never fed back. It turns no segment whose orientation is measured.
         """
         space = self._space
         if self._last_handed_out is None or self._last_handed_out[0] is not state:
@@ -55,8 +58,12 @@ class Output:
             known += offsets
             if state.sources.names:
                 q = self._middled(q, state.covariance[space.tangent, space.tangent])
-            elif self._parameters.posture:
-                q = self._upright(q, state.lengths, covariance)
+            if self._parameters.posture:
+                free, _ = self._priors.free(state, covariance, np.empty((space.size, 0), dtype=np.float32))
+                held = covariance - free
+                q = self._upright(q, state.lengths, free)
+                covariance = free + held
+                known = covariance[: space.observed, : space.observed]
             known += np.outer(disputed, disputed)
             self._last_handed_out = state, q, covariance
         return self._last_handed_out[1:]

@@ -13,9 +13,8 @@ from body_tracking.kinematics.compiled_posture import excess_of, prior_rows, sof
 _PRIOR_PERIOD = 0.1
 """Seconds between updates by the ranges of motion."""
 
-_POSTURE_TIME, _POSTURE_TIME_MEASURED = 1.0, 10.0
-"""Correlation time of posture in seconds: it counts as one observation per twice that time. The second one applies with
-measured orientations, which show more of the posture than points."""
+_POSTURE_TIME = 1.0
+"""Correlation time of posture in seconds: it counts as one observation per twice that time."""
 VAGUE = 0.5
 """Share of the range's deviation from which an angle is moved to the middle of its range."""
 _SPURIOUS = 0.7
@@ -28,7 +27,7 @@ _HARD_STDDEV = 0.2
 _PROJECTIONS = 3
 _FAR_BEYOND, _BACK_TO = np.radians(10.0), np.radians(8.0)
 """An estimate farther beyond a range than the first is brought back to the second."""
-_HELD_STDDEV = 0.02
+_HELD_STDDEV = 0.002
 """Radians: standard deviation by which priors may rotate a segment with a measured orientation."""
 _HELD_FOR_NS = NANOSECONDS // 4
 """A source without a measurement for longer does not constrain its segment."""
@@ -49,11 +48,7 @@ class Priors:
         self._prior = space.prior
         # the pseudo-measurements: coordinates, sharing of a twist, and inclination of the pelvis
         self._stddev = space.prior_table.stddev
-        self._range_stddev = np.append(self._ranges.stddev, self._stddev[-3:])
         self._postural = np.append(self._prior.postural, [True] * 3)
-        # what points show of the pelvis and the neck says nothing of how sensors are put on
-        trunk = [name.startswith(("lumbar", "thoracic", "clavicle")) for name in space.model.coordinate_names[6:]]
-        self._trunk = np.append(trunk, [True, False, False])
 
     def bounded(self, state: State) -> State:
         """Update by the ranges of motion: soft limits, and bounds of unobserved directions."""
@@ -65,8 +60,6 @@ class Priors:
             state.q, lines.posture.rotations[0], lines.rotation_jacobian[0], self._space.prior_table
         )
         excess = excess_of(coordinates, self._space.prior_table)
-        if state.sources.names:  # the posture prior is not validated with sensors whose mounting is being estimated
-            values[:-3], stddev = coordinates - self._ranges.centre, self._range_stddev
         tangent = self._free(state)[0][space.tangent, space.tangent]
         variance = ((gradients @ tangent) * gradients).sum(axis=1)
         # A coordinate whose variance exceeds that of its prior gets a pseudo-measurement at the prior's mean, with the
@@ -84,12 +77,10 @@ class Priors:
         state = self._unsure(state)
         if unknown.any():
             state = self._told(state, gradients[unknown], -values[unknown], noise[unknown], self._free(state))
-        if state.sources.names or self._parameters.posture:
-            time, rows = (
-                (_POSTURE_TIME_MEASURED, self._trunk) if state.sources.names else (_POSTURE_TIME, self._postural)
-            )
-            noise = 2.0 * time / _PRIOR_PERIOD * limit[rows]
-            state = self._told(state, gradients[rows], -values[rows], noise, (state.covariance, state.crosses))
+        if self._parameters.posture:
+            rows = self._postural
+            noise = 2.0 * _POSTURE_TIME / _PRIOR_PERIOD * limit[rows]
+            state = self._told(state, gradients[rows], -values[rows], noise, self._free(state))
         vague = (variance > (VAGUE * stddev) ** 2) & ~self._postural
         if vague.any() and not state.sources.names:
             state = self._drawn(state, gradients[vague], values[vague], stddev[vague])
@@ -222,20 +213,23 @@ class Priors:
         return space.moved(state, correction)
 
     def _free(self, state: State) -> tuple[FloatArray, SingleArray]:
-        """The covariance of all, and with the slow errors of cameras, as far as orientations leave a pose free.
+        """The covariance of all, and with the slow errors of cameras, as far as orientations leave a pose free."""
+        return self.free(state, state.covariance, state.crosses)
 
-        Priors must not rotate a segment with a measured orientation: the errors of its source would be corrected
-        instead, a little each time.
+    def free(self, state: State, covariance: FloatArray, crosses: SingleArray) -> tuple[FloatArray, SingleArray]:
+        """As far as orientations leave a pose free, its covariance (n, n), and that with m others (n, m).
+
+        Priors turn no segment whose orientation is measured: they have the same error time and again, and the errors
+        of the sources would be corrected instead.
         """
-        space = self._space
         speaking = state.stamp_ns - state.sources.stamps < _HELD_FOR_NS
         if not speaking.any():
-            return state.covariance, state.crosses
+            return covariance, crosses
+        t = self._space.tangent
         turning = self._model.linearised(state.q, state.lengths).rotation_jacobian[state.sources.segments[speaking]]
-        rows = turning.reshape(-1, space.nv)
-        cross = state.covariance[:, space.tangent] @ rows.T
-        s = rows @ cross[space.tangent]
+        rows = turning.reshape(-1, self._space.nv)
+        cross = rows @ covariance[t]
+        s = cross[:, t] @ rows.T
         s[np.arange(len(s)), np.arange(len(s))] += _HELD_STDDEV**2
-        held = np.linalg.solve(s, np.concatenate([cross.T, rows @ state.crosses[space.tangent]], axis=1))
-        size = len(state.covariance)
-        return state.covariance - cross @ held[:, :size], state.crosses - single(cross) @ single(held[:, size:])
+        gain: FloatArray = np.asarray(np.linalg.solve(s, cross).T, dtype=np.float64)
+        return covariance - gain @ cross, crosses - single(gain) @ (single(rows) @ crosses[t])
