@@ -72,7 +72,9 @@ def up_times(listener: Listener, *, viewer: bool) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         words = ("up", "--bag", BAG, "--log-dir", folder, *(("--viewer",) if viewer else ()))
         begin = time.monotonic()
-        process = subprocess.Popen([*COMMAND, *words], stdout=subprocess.PIPE, text=True, process_group=0)
+        process = subprocess.Popen(
+            [*COMMAND, *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, process_group=0
+        )
 
         def read() -> None:
             assert process.stdout is not None
