@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import array
 import importlib
-from collections.abc import Mapping
+from collections.abc import Callable
 from functools import cache
 from typing import Any, Protocol
 
@@ -51,13 +51,17 @@ class RosMessages:
 
 
 class BagMessages:
-    """The classes of a ``rosbags`` type store."""
+    """The classes of a ``rosbags`` type store.
 
-    def __init__(self, types: Mapping[str, Any]) -> None:
-        self._types = types
+    Args:
+        class_of: the class of a message type ``pkg/msg/Name``.
+    """
+
+    def __init__(self, class_of: Callable[[str], Any]) -> None:
+        self._class_of = class_of
 
     def make(self, type_name: str, /, **fields: Any) -> Any:
-        return self._types[type_name](**fields)
+        return self._class_of(type_name)(**fields)
 
     def octets(self, data: bytes) -> Any:
         return np.frombuffer(data, dtype=np.uint8)

@@ -19,7 +19,6 @@ errors. Encoding: OMG CDR, little-endian (XCDR1); alignment counts from the end 
 from __future__ import annotations
 
 import struct
-from collections import defaultdict
 from dataclasses import dataclass
 from functools import cache
 from types import SimpleNamespace
@@ -84,7 +83,7 @@ def _layout(bodies: int, covariance: bool, velocity: bool) -> _Layout:
     joints, states = np.zeros((N_JOINTS, 3)), np.zeros(N_JOINTS, np.uint8)
     covariances = np.zeros((N_JOINTS, 3, 3)) if covariance else None
     sample = Skeleton(0, "", joints, states, 0, covariances, joints if velocity else None)
-    cloud = skeletons_to_cloud([sample] * bodies, BagMessages(defaultdict(lambda: SimpleNamespace)))
+    cloud = skeletons_to_cloud([sample] * bodies, BagMessages(lambda type_name: SimpleNamespace))
     table, padding = struct.pack("<III", cloud.height, cloud.width, len(cloud.fields)), b"\xff" * 12
     for field in cloud.fields:
         name = _string(field.name)

@@ -16,13 +16,13 @@ import time
 from bisect import bisect_left
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from mcap.writer import Writer
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import Stores, get_typestore
 
 from body_tracking.core import qos as quality
 from body_tracking.core.files import FileError, FileLimitError, dump_yaml, load_yaml, open_regular, read_text
@@ -41,15 +41,22 @@ METADATA_VERSION = 9
 ROS_DISTRO = "jazzy"
 MAX_TIME_NS = 2**63 - 1
 
-_STORE = get_typestore(Stores.ROS2_JAZZY)
 
-BAG_MESSAGES = BagMessages(_STORE.types)
+@cache
+def _store() -> Any:
+    """The message definitions of ROS 2 Jazzy, imported when first used: that takes a quarter of a second."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+BAG_MESSAGES = BagMessages(lambda type_name: _store().types[type_name])
 """The message classes of recordings: ``BAG_MESSAGES.make("std_msgs/msg/String", data="")``."""
 
 
 def is_known(type_name: str) -> bool:
     """Whether there is a definition of a message type, such as ``sensor_msgs/msg/PointCloud2``."""
-    return type_name in _STORE.types
+    return type_name in _store().types
 
 
 def first_field(type_name: str) -> tuple[str, str, bool]:
@@ -57,7 +64,7 @@ def first_field(type_name: str) -> tuple[str, str, bool]:
 
     The type is empty for a number, a string, and an unknown message type.
     """
-    fields: list[Any] = list(_STORE.fielddefs[type_name][1]) if is_known(type_name) else []
+    fields: list[Any] = list(_store().fielddefs[type_name][1]) if is_known(type_name) else []
     if not fields:
         return "", "", False
     name, (node, what) = fields[0]
@@ -73,7 +80,7 @@ def serialize(message: Any) -> bytes:
         BagError: a field's value does not fit its type.
     """
     try:
-        return bytes(_STORE.serialize_cdr(message, message.__msgtype__))
+        return bytes(_store().serialize_cdr(message, message.__msgtype__))
     except Exception as error:
         raise BagError(f"{type(message).__name__} cannot be serialised: {error}") from error
 
@@ -90,7 +97,7 @@ def deserialize(type_name: str, cdr: bytes) -> Any:
     # state without efforts, or without velocities and efforts, is longer than its content.
     for room in (0, 4, 8):
         try:
-            return _STORE.deserialize_cdr(cdr[: len(cdr) - room], type_name)
+            return _store().deserialize_cdr(cdr[: len(cdr) - room], type_name)
         except Exception as error:
             if room == 0:
                 first = error
@@ -429,7 +436,7 @@ class BagWriter:
         metadata = {"offered_qos_profiles": offered, "topic_type_hash": _type_hash(type_name)}
         with self._writing():
             if type_name not in self._schemas:
-                definition, _ = _STORE.generate_msgdef(type_name, ros_version=2)
+                definition, _ = _store().generate_msgdef(type_name, ros_version=2)
                 self._schemas[type_name] = self._mcap.register_schema(type_name, "ros2msg", definition.encode())
             number = self._mcap.register_channel(topic, "cdr", self._schemas[type_name], metadata)
         self._channels[topic] = number, type_name
@@ -607,7 +614,7 @@ def _close_folder(folder: Path) -> None:
 
 
 def _type_hash(type_name: str) -> str:
-    return _STORE.hash_rihs01(type_name) if is_known(type_name) else ""
+    return _store().hash_rihs01(type_name) if is_known(type_name) else ""
 
 
 def _information(parts: Sequence[BagReader]) -> dict[str, Any]:
