@@ -64,6 +64,7 @@ def messages(stages: list[Stage]) -> list[dict[str, bytes]]:
     return [frames[stamp_ns] for stamp_ns in sorted(frames)]
 
 
+@pytest.mark.slow
 @pytest.mark.alone  # the browser draws in software, on all processors
 def test_a_browser_shows_balls_points_and_targets(tmp_path: Path) -> None:
     need_chromium()

@@ -65,6 +65,7 @@ def frames() -> list[dict[str, bytes]]:
     return [found[stamp_ns] for stamp_ns in sorted(found)]
 
 
+@pytest.mark.slow
 @pytest.mark.alone  # the browser draws in software, on all processors
 def test_a_browser_shows_the_mesh_and_its_image(tmp_path: Path) -> None:
     need_chromium()

@@ -65,6 +65,7 @@ def browser(tmp_path: Path) -> Iterator[Browser]:
             listener.join(10.0)
 
 
+@pytest.mark.slow
 @pytest.mark.alone  # the browser draws in software, on all processors
 def test_a_browser_shows_the_graph_and_its_buttons_work(browser: Browser, tmp_path: Path) -> None:
     running, page, clouds = browser.running, browser.page, browser.clouds
