@@ -387,6 +387,8 @@ def test_an_arm_follows_two_sensors_through_the_whole_graph_and_holds_when_they_
         killed = time.time()
         player.kill()
         assert robots.until(lambda: state() == State.HOLDING), robots.log("up")
+        # diagnostics may come while the commands still brake
+        assert robots.until(lambda: bool((arm.commands[-1][2] == arm.commands[-2][2]).all()), 5.0), arm.commands[-9:]
         followed = [each for each in arm.commands[begun:] if each[0] < killed]
         after = [each for each in arm.commands if each[0] >= killed]
         # on a busy machine a moment without angles may end an approach until the recording is over
