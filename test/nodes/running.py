@@ -28,6 +28,7 @@ from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.pipeline.graph import PARENT_VARIABLE, skeleton_topic
 from body_tracking.recording.rosbag2 import BagReader, deserialize
 from domains import domain
+from patience import PATIENCE
 from spinning import spin_until
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -169,7 +170,7 @@ class Running:
         words = ("--loop", "--replay", BAG, "--to", f"127.0.0.1:{port}")
         return self.start_module(name, "body_tracking.kinect.kinect_sender", *words)
 
-    def wait_for_links(self, links: Mapping[str, Mapping[str, int]], timeout: float = 60.0) -> None:
+    def wait_for_links(self, links: Mapping[str, Mapping[str, int]], timeout: float = PATIENCE) -> None:
         """Wait until nodes have found their subscribers.
 
         Args:
@@ -187,7 +188,7 @@ class Running:
 
         assert self.until(lambda: not missing(), timeout), (missing(), self.diagnostics)
 
-    def call(self, kind: type[Any], name: str, request: Any, timeout: float = 60.0) -> Any:
+    def call(self, kind: type[Any], name: str, request: Any, timeout: float = PATIENCE) -> Any:
         """The response of a service, which may be called several times.
 
         DDS lists the service of a killed node for a while, and a request may go to it alone.
@@ -205,7 +206,7 @@ class Running:
                     return future.result()
         raise AssertionError(f"{name} does not answer: {self.diagnostics}")
 
-    def resume(self, timeout: float = 60.0) -> None:
+    def resume(self, timeout: float = PATIENCE) -> None:
         """Let a ``bag_player`` that was started paused go on."""
         assert self.call(Trigger, "/bag_player/resume", Trigger.Request(), timeout).success
 
@@ -219,7 +220,7 @@ class Running:
         """What a node printed so far."""
         return (self.folder / f"{executable}.log").read_text()
 
-    def until(self, condition: Callable[[], object], timeout: float = 60.0) -> bool:
+    def until(self, condition: Callable[[], object], timeout: float = PATIENCE) -> bool:
         """Spin until something is so; whether it became so in time."""
         return spin_until(self.executor, condition, timeout)
 

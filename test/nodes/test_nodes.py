@@ -357,7 +357,7 @@ def test_backend_whose_status_raises_keeps_publishing(tmp_path: Path) -> None:
     with Running(tmp_path) as running:
         running.environment |= installed(tmp_path, "mycamera:Mute")
         process = running.start_interpreter("kinect_skeleton", backend="mine")
-        assert running.until(lambda: running.said("kinect_skeleton").get("published") == "3", 60.0)
+        assert running.until(lambda: running.said("kinect_skeleton").get("published") == "3")
         assert running.said("kinect_skeleton").get("", "") == "streaming; counters: KeyError: 'temperature'"
         assert "in counters" in running.log("kinect_skeleton")
         assert stop(process) == 0
