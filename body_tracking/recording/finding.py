@@ -13,8 +13,9 @@ from body_tracking.core.parameters import Value
 SETUPS: Final[Mapping[str, Mapping[str, Value]]] = {
     "cameras_turning": {"camera_rig": "config/camera_rig", "compressed": "colour"},
     "markers_arm": {"marker_setup": "config/marker_setup", "sensors": ()},
+    "mesh_reaching": {"depth": ("kinect1",)},
 }
-"""Options of ``up`` that play those of the shipped recordings whose sensors cannot be found by their topics."""
+"""Options of ``up`` that play those of the shipped recordings whose topics do not say how."""
 
 
 def is_bag(path: Path) -> bool:

@@ -53,9 +53,9 @@ class Output:
         space = self._space
         if self._last_handed_out is None or self._last_handed_out[0] is not state:
             q, covariance = state.q, state.covariance[: space.size, : space.size].copy()
-            known = covariance[: space.observed, : space.observed]
+            pose = slice(space.observed)
             offsets, disputed = self._displacement.displaced(state)
-            known += offsets
+            covariance[pose, pose] += offsets
             if state.sources.names:
                 q = self._middled(q, state.covariance[space.tangent, space.tangent])
             if self._parameters.posture:
@@ -63,8 +63,7 @@ class Output:
                 held = covariance - free
                 q = self._upright(q, state.lengths, free)
                 covariance = free + held
-                known = covariance[: space.observed, : space.observed]
-            known += np.outer(disputed, disputed)
+            covariance[pose, pose] += np.outer(disputed, disputed)
             self._last_handed_out = state, q, covariance
         return self._last_handed_out[1:]
 
