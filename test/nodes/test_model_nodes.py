@@ -178,9 +178,6 @@ def test_late_subscriber_gets_the_urdf(tracking: Tracking) -> None:
 
 
 def test_without_inputs_the_filter_predicts_and_then_stops(tracking: Tracking) -> None:
-    tracking.cut_short()
-    tracking.play(40)
-
     def predicted_ones() -> list[Skeleton]:
         """Those after the last in which a sensor saw something."""
         seen = [cloud_to_skeletons(cloud)[0] for cloud in tracking.skeletons]
@@ -188,10 +185,15 @@ def test_without_inputs_the_filter_predicts_and_then_stops(tracking: Tracking) -
         return seen[real[-1] + 1 :] if real else []
 
     # 30 a second, from 0.3 s to the 2 s that the filter allows itself; messages are best effort, and a busy machine
-    # loses some
-    assert tracking.until(lambda: len(predicted_ones()) >= 15, 30.0)
-    tracking.until(lambda: False, timeout=2.5)
-    predicted = predicted_ones()
+    # loses some, or holds up a frame of a sensor until the filter has predicted its time already
+    for _ in range(4):
+        tracking.cut_short()
+        tracking.play(40)
+        assert tracking.until(lambda: len(predicted_ones()) >= 15)
+        tracking.until(lambda: False, timeout=2.5)
+        predicted = predicted_ones()
+        if len(predicted) >= 15:
+            break
     assert 15 <= len(predicted) <= 55
     assert all((each.states <= TrackingState.INFERRED).all() for each in predicted)
     steps = np.diff([each.stamp_ns for each in predicted]) / (NANOSECONDS / 30)
