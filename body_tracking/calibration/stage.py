@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +84,10 @@ class CalibrationStage(Stage):
         self.values = values
 
     def start(self, now: Now) -> Iterable[Output]:
-        return self._published([self.calibration.current_update()])
+        update = self.calibration.current_update()
+        # Valid for all times: without the drift of an earlier session, which the time since 1970 would make minutes.
+        clocks = {sensor: replace(clock, drift_ppm=0.0) for sensor, clock in update.result.clocks.items()}
+        return self._published([replace(update, result=replace(update.result, clocks=clocks))])
 
     def take(self, topic: str, payload: Any, now: Now) -> Iterable[Output]:
         sensor = self._sensors[topic]

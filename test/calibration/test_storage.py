@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,14 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from body_tracking.calibration.rigid import CalibrationError
+from body_tracking.calibration.stage import CalibrationStage
 from body_tracking.calibration.storage import load, save
 from body_tracking.core.clocks import ClockModel
 from body_tracking.core.sensor_poses import CalibrationResult, SensorPose, SensorQuality, level_pose
+from body_tracking.core.skeleton import NANOSECONDS
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.stage import Now
+from body_tracking.recording.rosbag2 import BAG_WIRE
 
 
 def example(seed: int = 0) -> CalibrationResult:
@@ -43,6 +49,26 @@ def test_a_calibration_survives_the_disk(tmp_path_factory: pytest.TempPathFactor
         assert_allclose(read.quality[name].rotation_stddev, result.quality[name].rotation_stddev)
         assert read.quality[name].clock_stddev == result.quality[name].clock_stddev
         assert read.quality[name].clock_drift_stddev_ppm == result.quality[name].clock_drift_stddev_ppm
+
+
+def test_the_clock_of_a_file_is_published_as_the_offset_that_was_estimated(tmp_path: Path) -> None:
+    """What holds for all times carries no drift: by the time since 1970, 0.2 ppm make a clock six minutes wrong."""
+    path, now_ns = tmp_path / "room.yaml", 1_790_000_000 * NANOSECONDS
+    result = example()
+    for drift_ppm in (-300.0, -0.2, 0.0, 0.2, 300.0):
+        clock = ClockModel(2_400_000, drift_ppm, now_ns - 60 * NANOSECONDS)
+        save(replace(result, clocks=result.clocks | {"kinect2": clock}), path)
+        values = {each.name: each.default for each in CalibrationStage.PARAMETERS} | {"calibration_file": str(path)}
+        stage = CalibrationStage(values)
+        (port,) = [each for each in stage.outputs if each.topic == graph.CALIBRATION_CLOCK]
+        (payload,) = [each.payload for each in stage.start(Now(0, 0)) if each.topic == graph.CALIBRATION_CLOCK]
+        received = port.codec.decode(port.codec.encode(payload, BAG_WIRE), BAG_WIRE)
+        assert received.valid_from_ns == 0
+        for carried in (payload, received):
+            assert abs(carried.clock.offset_ns_at(now_ns) - clock.offset_ns) <= 1
+        stage._unsaved = True
+        stage.save()  # the drift is kept for the next session's start
+        assert load(path).clocks["kinect2"].drift_ppm == drift_ppm
 
 
 @pytest.mark.parametrize(
