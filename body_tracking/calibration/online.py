@@ -23,7 +23,7 @@ from body_tracking.calibration.still_pose import FRAMES, is_still, is_t_pose, st
 from body_tracking.calibration.turned import best_estimate, half_turn_from, registration
 from body_tracking.core import so3
 from body_tracking.core.clocks import ClockModel, jumped_back
-from body_tracking.core.measurement import joint_stddev
+from body_tracking.core.measurement import joint_variance
 from body_tracking.core.parameters import number_field
 from body_tracking.core.sensor_poses import CalibrationResult, SensorPose, SensorQuality, level_pose
 from body_tracking.core.skeleton import MIRROR, N_JOINTS, NANOSECONDS, FloatArray, Skeleton
@@ -141,6 +141,7 @@ class _Track:
         self.stamps: list[int] = []
         self.positions: list[FloatArray] = []
         self.states: list[np.ndarray] = []
+        self.variances: list[FloatArray] = []
         self.delays: list[int] = []  # receipt less stamp
         self.late = 0
 
@@ -153,6 +154,7 @@ class _Track:
         known = skeleton.valid
         self.positions.append(np.where(known[:, None], skeleton.positions, np.nan))
         self.states.append(np.where(known, skeleton.states, 0))
+        self.variances.append(joint_variance(skeleton))
         self.delays.append(received_ns - skeleton.stamp_ns)
         return True
 
@@ -160,7 +162,7 @@ class _Track:
         # In steps, because each deletion moves the whole list.
         old = bisect_right(self.stamps, stamp_ns)
         if old > 256:
-            for values in (self.stamps, self.positions, self.states, self.delays):
+            for values in (self.stamps, self.positions, self.states, self.variances, self.delays):
                 del values[:old]
 
     def delay(self, first_ns: int, last_ns: int) -> float | None:
@@ -180,8 +182,8 @@ class _Track:
             np.stack(self.states[start:stop]),
         )
 
-    def at(self, stamp_ns: int) -> tuple[FloatArray, FloatArray, np.ndarray] | None:
-        """Positions (25, 3), velocities and states at a time of the sensor's clock, between two frames."""
+    def at(self, stamp_ns: int) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """Positions (25, 3), velocities and variances (25,) at a time of the sensor's clock, between two frames."""
         after = bisect_right(self.stamps, stamp_ns)
         if not 0 < after < len(self.stamps):
             return None
@@ -190,8 +192,8 @@ class _Track:
             return None
         velocity = (self.positions[after] - self.positions[after - 1]) / step
         elapsed = (stamp_ns - self.stamps[after - 1]) / NANOSECONDS
-        states = np.minimum(self.states[after - 1], self.states[after])
-        return self.positions[after - 1] + elapsed * velocity, velocity, states
+        variance = np.maximum(self.variances[after - 1], self.variances[after])
+        return self.positions[after - 1] + elapsed * velocity, velocity, variance
 
 
 class _Sensor:
@@ -424,10 +426,10 @@ class OnlineCalibration:
             if seen is None:
                 continue
             reference = track.positions[index]
-            stddev = joint_stddev(np.stack([reference, seen[0]]), np.stack([track.states[index], seen[2]]))
-            if np.isfinite(stddev).all(axis=0).sum() < 5:
+            variance = track.variances[index] + seen[2]
+            if np.isfinite(variance).sum() < 5:
                 continue
-            other.pairs.add((stamp - self._anchor) / NANOSECONDS, reference, seen[0], seen[1], (stddev**2).sum(axis=0))
+            other.pairs.add((stamp - self._anchor) / NANOSECONDS, reference, seen[0], seen[1], variance)
 
     def _pair_anew(self, other: _Sensor, horizon: int) -> None:
         other.pairs.clear()

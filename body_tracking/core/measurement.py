@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from body_tracking.core.skeleton import BONES, BoolArray, FloatArray, Joint, TrackingState
+from body_tracking.core.skeleton import BONES, BoolArray, FloatArray, Joint, Skeleton, TrackingState
 
 # Standard deviation of a Tracked joint of a body that faces the sensor at 2 m, metres. Kinect v2 against markers:
 # trunk and elbows about 20-40 mm, hand tips, thumbs and feet two to three times that (Wang 2015, Napoli 2017,
@@ -134,3 +134,21 @@ def joint_stddev(positions: FloatArray, states: np.ndarray, angle: FloatArray | 
     usable: BoolArray = (states > TrackingState.NOT_TRACKED) & np.isfinite(positions).all(axis=-1)
     result: FloatArray = np.where(usable, stddev, np.inf)
     return result
+
+
+def joint_variance(skeleton: Skeleton, angle: FloatArray | None = None) -> FloatArray:
+    """The variance of each joint position per axis: as its sensor states it, else of :func:`joint_stddev`.
+
+    Args:
+        skeleton: in the sensor's optical frame.
+        angle: :func:`viewing_angle` of its positions; computed when None.
+
+    Returns:
+        (25,) square metres, of stated covariances the mean over the axes; infinity for joints that are not tracked or not
+        finite.
+    """
+    if skeleton.covariances is None:
+        return joint_stddev(skeleton.positions, skeleton.states, angle) ** 2
+    stated = skeleton.covariances.trace(axis1=1, axis2=2) / 3.0
+    variance: FloatArray = np.where(skeleton.valid & (stated > 0.0), stated, np.inf)
+    return variance

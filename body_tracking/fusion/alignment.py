@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from body_tracking.core.clocks import jumped_back
-from body_tracking.core.measurement import joint_stddev, viewing_angle
+from body_tracking.core.measurement import joint_variance, viewing_angle
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.sides import heading_weights, headings_of, reversed_halves, swap_left_right
 from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton
@@ -172,7 +172,7 @@ def _in_world(skeleton: Skeleton, stamp_ns: int, pose: SensorPose) -> _Frame:
     positions = np.where(known[:, None], skeleton.positions, np.nan)
     states = np.where(known, skeleton.states, 0)
     angle = viewing_angle(positions)
-    variance = joint_stddev(positions, states, angle) ** 2
+    variance = joint_variance(skeleton, angle)
     placed = pose.apply(positions)
     headings, weights = headings_of(placed), heading_weights(placed, variance)
     return _Frame(stamp_ns, placed, variance, states, float(angle), headings, weights, skeleton.body)

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from body_tracking.core.clocks import JUMP_BACK_NS, jumped_back
-from body_tracking.core.measurement import joint_stddev, viewing_angle
+from body_tracking.core.measurement import joint_variance, viewing_angle
 from body_tracking.core.parameters import number_field
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.sides import PAIRS
@@ -228,7 +228,7 @@ class Fusion(PlacedSensors[_Sensor]):
             velocities = np.zeros((N_JOINTS, 3))
             since = stamp
         angle = viewing_angle(positions)
-        variance = joint_stddev(positions, states, angle) ** 2
+        variance = joint_variance(skeleton, angle)
         source.frames.append(
             _Frame(skeleton.stamp_ns, positions, velocities, variance, states, float(angle), skeleton.body, since)
         )
