@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -12,9 +14,10 @@ from body_tracking.core.measurement import (
     body_heading,
     joint_correlation,
     joint_stddev,
+    joint_variance,
     viewing_angle,
 )
-from body_tracking.core.skeleton import BONES, MIRROR, N_JOINTS, Joint
+from body_tracking.core.skeleton import BONES, MIRROR, N_JOINTS, Joint, Skeleton
 from walkers import TRACKED, about_y, walk
 
 BODY = walk(np.zeros(1))[0]
@@ -52,6 +55,19 @@ def test_untracked_joints_have_infinite_noise() -> None:
     stddev = joint_stddev(positions, states)
     assert np.isinf(stddev[[Joint.HEAD, Joint.FOOT_LEFT]]).all()
     assert np.isfinite(np.delete(stddev, [Joint.HEAD, Joint.FOOT_LEFT])).all()
+
+
+def test_a_sensor_that_states_covariances_is_taken_at_its_word() -> None:
+    states = TRACKED.copy()
+    states[Joint.HEAD] = 0
+    plain = Skeleton(0, "camera1", AT_TWO_METRES, states)
+    assert_allclose(joint_variance(plain), joint_stddev(AT_TWO_METRES, states) ** 2)
+    covariances = np.tile(np.diag([0.01**2, 0.02**2, 0.06**2]), (N_JOINTS, 1, 1))
+    covariances[Joint.HAND_LEFT] = np.nan
+    variance = joint_variance(replace(plain, covariances=covariances))
+    unknown = [Joint.HEAD, Joint.HAND_LEFT]
+    assert np.isinf(variance[unknown]).all()
+    assert_allclose(np.delete(variance, unknown), (0.01**2 + 0.02**2 + 0.06**2) / 3.0)
 
 
 def test_frames_are_weighed_one_by_one_or_together() -> None:

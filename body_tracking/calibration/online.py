@@ -31,8 +31,9 @@ from body_tracking.core.skeleton import MIRROR, N_JOINTS, NANOSECONDS, FloatArra
 PAIR_PERIOD = 0.1
 """Seconds of reference time between stored pairs: errors of frames closer together are correlated."""
 
-MAX_BRACKET = 0.09
-"""Longest interval between two frames of a sensor for interpolation, seconds."""
+MAX_BRACKET = 0.15
+"""Longest interval between two frames of a sensor for interpolation, seconds: of a camera of seven images a second. A
+limb that brakes by 5 m/s2 then errs by 14 mm in the middle, no more than the joints' noise."""
 
 GUESS_FRAMES = 30
 """Frames of a sensor whose delay of receipt gives the first guess of its clock."""
@@ -192,8 +193,10 @@ class _Track:
             return None
         velocity = (self.positions[after] - self.positions[after - 1]) / step
         elapsed = (stamp_ns - self.stamps[after - 1]) / NANOSECONDS
+        positions = self.positions[after - 1] + elapsed * velocity
         variance = np.maximum(self.variances[after - 1], self.variances[after])
-        return self.positions[after - 1] + elapsed * velocity, velocity, variance
+        # also where the difference of two valid positions overflows
+        return positions, velocity, np.where(np.isfinite(positions).all(axis=1), variance, np.inf)
 
 
 class _Sensor:

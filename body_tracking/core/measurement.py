@@ -144,11 +144,14 @@ def joint_variance(skeleton: Skeleton, angle: FloatArray | None = None) -> Float
         angle: :func:`viewing_angle` of its positions; computed when None.
 
     Returns:
-        (25,) square metres, of stated covariances the mean over the axes; infinity for joints that are not tracked or not
-        finite.
+        (25,) square metres, of stated covariances the mean over the axes; infinity for joints that are not tracked or
+        not finite.
     """
+    known = skeleton.valid
     if skeleton.covariances is None:
-        return joint_stddev(skeleton.positions, skeleton.states, angle) ** 2
+        # the distance and the angle of view are of valid joints, too
+        positions = np.where(known[:, None], skeleton.positions, np.nan)
+        return joint_stddev(positions, np.where(known, skeleton.states, 0), angle) ** 2
     stated = skeleton.covariances.trace(axis1=1, axis2=2) / 3.0
-    variance: FloatArray = np.where(skeleton.valid & (stated > 0.0), stated, np.inf)
+    variance: FloatArray = np.where(known & (stated > 0.0), stated, np.inf)
     return variance

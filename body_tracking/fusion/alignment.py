@@ -89,9 +89,10 @@ class SensorAlignment(PlacedSensors[_Sensor]):
             skeleton: in the sensor's optical frame and clock.
 
         Returns:
-            The same body at its capture time in the reference's clock, with the covariances of
-            ``core/measurement.py``, isotropic; joints that are not valid, and those of a body half whose axis is across
-            the accepted one, are NaN and NOT_TRACKED. None while the sensor is not calibrated.
+            The same body at its capture time in the reference's clock, with isotropic covariances
+            (:func:`~body_tracking.core.measurement.joint_variance`); joints that are not valid, and those of a body
+            half whose axis is across the accepted one, are NaN and NOT_TRACKED. None while the sensor is not
+            calibrated.
         """
         source = self._known(sensor)
         if source is None:

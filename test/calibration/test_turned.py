@@ -54,6 +54,25 @@ def test_the_half_turn_is_found_from_either_start(motion: str, turned: float) ->
     assert angle_to(found.rotation) < 3.0
 
 
+def test_where_residuals_hardly_differ_the_sensors_agree_on_left_and_right() -> None:
+    """A symmetric body as flat as a picture looks alike from both sides, but for noise."""
+    for seed in range(10):
+        pairs = pairs_of("standing_still", 0.0, seed)
+        reference = pairs.reference.copy()
+        reference[..., 2] = 2.5
+        reference[..., 0] = 0.5 * (reference[..., 0] - reference[:, MIRROR, 0])
+        reference[..., 1] = 0.5 * (reference[..., 1] + reference[:, MIRROR, 1])
+        noise = np.random.default_rng([seed, 1]).normal(scale=0.03, size=reference.shape)
+        pairs = replace(pairs, reference=reference, sensor=(reference + noise - TRANSLATION) @ ROTATION)
+        labels = registration(pairs)
+        assert labels is not None
+        opposite = half_turn_from(pairs, labels[0])
+        assert opposite is not None
+        found = best_estimate(pairs, [opposite, labels])
+        assert found is not None
+        assert angle_to(found.rotation) < 10.0
+
+
 def test_frames_are_exchanged_as_if_the_sensor_had_said_so() -> None:
     pairs = pairs_of("hair_combing", 0.0)
     pairs.variance[:, Joint.HAND_LEFT] = np.inf

@@ -105,6 +105,22 @@ def test_a_joint_behind_a_table_is_inferred_where_it_is_expected() -> None:
     assert body.states[Joint.ELBOW_LEFT] == TrackingState.TRACKED
 
 
+@pytest.mark.parametrize(("gap", "hidden"), [(0.05, 0.0), (0.12, 0.5), (0.25, 1.0)])
+def test_the_far_shoulder_of_somebody_who_stands_obliquely_is_not_at_the_chest(gap: float, hidden: float) -> None:
+    found, depth = person()
+    world = found.world.copy()
+    far = [Landmark.SHOULDER_RIGHT, Landmark.HIP_RIGHT]
+    world[far, 2] += gap
+    before, body = lift(found, depth, CAMERA), lift(replace(found, world=world), depth, CAMERA)
+    assert before is not None and body is not None
+    for joint, other in ((Joint.SHOULDER_RIGHT, Joint.SHOULDER_LEFT), (Joint.HIP_RIGHT, Joint.HIP_LEFT)):
+        np.testing.assert_allclose(body.positions[other], before.positions[other])
+        moved = body.positions[joint, 2] - before.positions[joint, 2]
+        assert abs(moved - hidden * gap) < 0.02
+        deeper = np.linalg.eigvalsh(body.covariances[joint])[-1] - np.linalg.eigvalsh(before.covariances[joint])[-1]
+        assert deeper > 0.0 or hidden < 1.0
+
+
 def test_what_lies_outside_the_image_is_not_invented() -> None:
     found, depth = person()
     above = replace(found, pixels=found.pixels + [0.0, 180.0])
