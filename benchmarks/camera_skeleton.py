@@ -93,6 +93,7 @@ ABLATION: Mapping[str, Mapping[str, Any]] = {
     "scatter of the surface": {"_surface_near": _without_scatter},
     "doubt where depths disagree": {"_DISAGREED": 0.0},
     "spine in the trunk's mask": {"_SPINE": 0.0},
+    "far shoulder and hip by the near ones": {"_TURNED": (10.0, 11.0)},
 }
 """Mechanisms of the lifting, and the names in ``camera.lifting`` whose other values leave each of them out."""
 

@@ -62,12 +62,15 @@ def test_a_sensor_that_states_covariances_is_taken_at_its_word() -> None:
     states[Joint.HEAD] = 0
     plain = Skeleton(0, "camera1", AT_TWO_METRES, states)
     assert_allclose(joint_variance(plain), joint_stddev(AT_TWO_METRES, states) ** 2)
-    covariances = np.tile(np.diag([0.01**2, 0.02**2, 0.06**2]), (N_JOINTS, 1, 1))
+    covariances = np.tile(np.diag([0.05**2, 0.06**2, 0.2**2]), (N_JOINTS, 1, 1))
     covariances[Joint.HAND_LEFT] = np.nan
     variance = joint_variance(replace(plain, covariances=covariances))
     unknown = [Joint.HEAD, Joint.HAND_LEFT]
     assert np.isinf(variance[unknown]).all()
-    assert_allclose(np.delete(variance, unknown), (0.01**2 + 0.02**2 + 0.06**2) / 3.0)
+    assert_allclose(np.delete(variance, unknown), (0.05**2 + 0.06**2 + 0.2**2) / 3.0)
+    # but not below the errors of which the correlation is known
+    smaller = joint_variance(replace(plain, covariances=0.01 * covariances))
+    assert_allclose(np.delete(smaller, unknown), np.delete(BASE_STDDEV**2, unknown))
 
 
 def test_frames_are_weighed_one_by_one_or_together() -> None:
