@@ -110,6 +110,8 @@ class SensorAlignment(PlacedSensors[_Sensor]):
             self.counters["other_clock"] += 1
             return None
         source.forget_before(stamp - _KEEP)
+        if skeleton.covariances is not None:  # no Kinect
+            self._sides.sided.add(sensor)
         seen = _in_world(skeleton, stamp, pose)
         if source.newest is None or stamp > source.newest.stamp_ns:
             source.newest = seen

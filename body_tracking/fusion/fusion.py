@@ -183,6 +183,8 @@ class Fusion(PlacedSensors[_Sensor]):
             return False
         if sensor == self.reference:
             self._restart_behind(stamp, now_ns)
+        if skeleton.covariances is not None:  # no Kinect
+            self._sides.sided.add(sensor)
         # Frames are remembered before the sensor is calibrated, so that it is known by then when its next one is due.
         self._remember(source, skeleton, stamp)
         if source.pose(stamp) is None:

@@ -21,7 +21,7 @@ from body_tracking.core.measurement import left_right_axes
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton
 from body_tracking.fusion.fusion import Fusion, FusionParameters
 from body_tracking.fusion.placement import FusionError
-from body_tracking.fusion.sides import HOLD
+from body_tracking.fusion.sides import HOLD, MIN_HOLD
 from body_tracking.kinect.csv_recording import CsvRecording
 from draws import draws, some
 from walkers import TRACKED, about_y, frame
@@ -275,6 +275,19 @@ def test_a_common_reversal_is_held_and_then_followed_by_turning() -> None:
     assert made.counters["reversals_accepted"] > 0
     # In the end the reversal is accepted.
     assert errors(fused)[-1].max() > 0.2
+
+
+def test_a_sensor_that_tells_left_from_right_is_followed_soon() -> None:
+    """A camera whose person turned round while nobody saw it: seen reversed, and rightly so."""
+
+    def stated(seen: Skeleton) -> Skeleton:
+        given = replace(seen, covariances=np.tile(0.04**2 * np.eye(3), (25, 1, 1)))
+        return given if seen.stamp > 3.0 else given.mirrored()
+
+    made = fusion(["kinect1"])
+    fused = run(made, changed(of_one(8.0), "kinect1", stated))
+    assert made.counters["reversals_accepted"] > 0
+    assert errors(fused)[[each.stamp > 3.0 + MIN_HOLD + 0.8 for each in fused]].max() < 0.1
 
 
 def test_outliers_of_a_joint_are_gated_and_a_lasting_change_is_accepted() -> None:
