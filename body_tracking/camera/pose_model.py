@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.core.skeleton import FloatArray, SingleArray
+from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray, SingleArray
 
 DETECTOR_FILE: Final = "pose_detection.tflite"
 LANDMARKS_FILE: Final = "pose_landmark_full.tflite"
@@ -237,20 +237,21 @@ def _refined(flat: FloatArray, heat: SingleArray) -> FloatArray:
         flat: (n, 2) in sides of the region.
         heat: (64, 64, n) logits.
     """
-    moved = flat.copy()
     cells = np.floor(flat * _HEATMAP_PIXELS).astype(int)
-    for k, (column, row) in enumerate(cells):
-        if not (0 <= column < _HEATMAP_PIXELS and 0 <= row < _HEATMAP_PIXELS):
-            continue
-        left, top = max(column - _REFINED_OVER, 0), max(row - _REFINED_OVER, 0)
-        patch = _sigmoid(heat[top : row + _REFINED_OVER + 1, left : column + _REFINED_OVER + 1, k].astype(np.float64))
-        total = float(patch.sum())
-        if patch.max() < _REFINED_FROM or total <= 0.0:
-            continue
-        rows, columns = np.mgrid[: patch.shape[0], : patch.shape[1]]
-        centre = np.array([(patch * columns).sum(), (patch * rows).sum()]) / total
-        moved[k] = (centre + [left, top]) / _HEATMAP_PIXELS
-    return moved
+    reach = np.arange(-_REFINED_OVER, _REFINED_OVER + 1)
+    columns, rows = cells[:, :1] + reach, cells[:, 1:] + reach  # (n, 2 over + 1)
+    there = _in_heatmap(rows)[:, :, None] & _in_heatmap(columns)[:, None]
+    taken = np.clip(rows, 0, _HEATMAP_PIXELS - 1)[:, :, None], np.clip(columns, 0, _HEATMAP_PIXELS - 1)[:, None]
+    patches = np.where(there, _sigmoid(heat[(*taken, np.arange(len(flat))[:, None, None])].astype(np.float64)), 0.0)
+    total = patches.sum(axis=(1, 2))
+    sure = _in_heatmap(cells).all(axis=1) & (patches.max(axis=(1, 2)) >= _REFINED_FROM) & (total > 0.0)
+    moments = np.stack([(patches.sum(axis=1) * columns).sum(axis=1), (patches.sum(axis=2) * rows).sum(axis=1)], axis=1)
+    centres = moments / np.where(sure, total, 1.0)[:, None] / _HEATMAP_PIXELS
+    return np.where(sure[:, None], centres, flat)
+
+
+def _in_heatmap(cells: IntArray) -> BoolArray:
+    return (cells >= 0) & (cells < _HEATMAP_PIXELS)
 
 
 class _Network:
