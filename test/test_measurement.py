@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -17,7 +15,7 @@ from body_tracking.core.measurement import (
     joint_variance,
     viewing_angle,
 )
-from body_tracking.core.skeleton import BONES, MIRROR, N_JOINTS, Joint, Skeleton
+from body_tracking.core.skeleton import BONES, MIRROR, N_JOINTS, Joint
 from walkers import TRACKED, about_y, walk
 
 BODY = walk(np.zeros(1))[0]
@@ -60,16 +58,15 @@ def test_untracked_joints_have_infinite_noise() -> None:
 def test_a_sensor_that_states_covariances_is_taken_at_its_word() -> None:
     states = TRACKED.copy()
     states[Joint.HEAD] = 0
-    plain = Skeleton(0, "camera1", AT_TWO_METRES, states)
-    assert_allclose(joint_variance(plain), joint_stddev(AT_TWO_METRES, states) ** 2)
+    assert_allclose(joint_variance(AT_TWO_METRES, states, None), joint_stddev(AT_TWO_METRES, states) ** 2)
     covariances = np.tile(np.diag([0.05**2, 0.06**2, 0.2**2]), (N_JOINTS, 1, 1))
     covariances[Joint.HAND_LEFT] = np.nan
-    variance = joint_variance(replace(plain, covariances=covariances))
+    variance = joint_variance(AT_TWO_METRES, states, covariances)
     unknown = [Joint.HEAD, Joint.HAND_LEFT]
     assert np.isinf(variance[unknown]).all()
     assert_allclose(np.delete(variance, unknown), (0.05**2 + 0.06**2 + 0.2**2) / 3.0)
     # but not below the errors of which the correlation is known
-    smaller = joint_variance(replace(plain, covariances=0.01 * covariances))
+    smaller = joint_variance(AT_TWO_METRES, states, 0.01 * covariances)
     assert_allclose(np.delete(smaller, unknown), np.delete(BASE_STDDEV**2, unknown))
 
 

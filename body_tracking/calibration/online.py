@@ -155,7 +155,7 @@ class _Track:
         known = skeleton.valid
         self.positions.append(np.where(known[:, None], skeleton.positions, np.nan))
         self.states.append(np.where(known, skeleton.states, 0))
-        self.variances.append(joint_variance(skeleton))
+        self.variances.append(joint_variance(self.positions[-1], self.states[-1], skeleton.covariances))
         self.delays.append(received_ns - skeleton.stamp_ns)
         return True
 

@@ -155,7 +155,7 @@ def lift(found: Landmarks, depth: SingleArray, camera: Camera) -> Lifted | None:
 
 
 def _behind_the_trunk(depths: FloatArray, relative: FloatArray, seen: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """The depths with those of shoulders and hips that the trunk hides: the other one's, and the difference expected.
+    """Replace the depths of a shoulder and a hip that the trunk hides by the other one's plus the expected difference.
 
     Somebody who stands at 45 degrees shows one shoulder, and the chest 80 mm in front of the other one.
 
@@ -165,7 +165,7 @@ def _behind_the_trunk(depths: FloatArray, relative: FloatArray, seen: BoolArray)
         seen: (n,) joints whose depth is measured.
 
     Returns:
-        The depths, and (n,) how far each is such a one, from 0 to 1.
+        The depths, and (n,) the share of each that is replaced, 0 to 1.
     """
     depths, hidden = depths.copy(), np.zeros(len(depths))
     for pair in _PAIRS:

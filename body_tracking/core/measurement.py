@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from body_tracking.core.skeleton import BONES, BoolArray, FloatArray, Joint, Skeleton, TrackingState
+from body_tracking.core.skeleton import BONES, BoolArray, FloatArray, Joint, TrackingState
 
 # Standard deviation of a Tracked joint of a body that faces the sensor at 2 m, metres. Kinect v2 against markers:
 # trunk and elbows about 20-40 mm, hand tips, thumbs and feet two to three times that (Wang 2015, Napoli 2017,
@@ -136,26 +136,28 @@ def joint_stddev(positions: FloatArray, states: np.ndarray, angle: FloatArray | 
     return result
 
 
-def joint_variance(skeleton: Skeleton, angle: FloatArray | None = None) -> FloatArray:
-    """The variance of each joint position per axis: as its sensor states it, else of :func:`joint_stddev`.
+def joint_variance(
+    positions: FloatArray, states: np.ndarray, covariances: FloatArray | None, angle: FloatArray | None = None
+) -> FloatArray:
+    """The variance of each joint position of a frame per axis: as its sensor states it, else of :func:`joint_stddev`.
 
     Nothing counts as more certain than :data:`BASE_STDDEV`: the deviations of a linear filter's angles take errors of
     neighbouring joints to be as much alike as a Kinect's (:data:`BONE_CORRELATION`). With the 15 mm that the fit of a
     mesh states, the elevation was within 1.96 deviations in 80 % of the frames; so it is in 93 %.
 
     Args:
-        skeleton: in the sensor's optical frame.
-        angle: :func:`viewing_angle` of its positions; computed when None.
+        positions: (25, 3) metres in the sensor's optical frame.
+        states: (25,) tracking states.
+        covariances: (25, 3, 3) square metres, or None where the sensor states none.
+        angle: :func:`viewing_angle` of the positions; computed when None.
 
     Returns:
         (25,) square metres, of stated covariances the mean over the axes; infinity for joints that are not tracked or
         not finite.
     """
-    known = skeleton.valid
-    if skeleton.covariances is None:
-        # the distance and the angle of view are of valid joints, too
-        positions = np.where(known[:, None], skeleton.positions, np.nan)
-        return joint_stddev(positions, np.where(known, skeleton.states, 0), angle) ** 2
-    stated = skeleton.covariances.trace(axis1=1, axis2=2) / 3.0
-    variance: FloatArray = np.where(known & (stated > 0.0), np.maximum(stated, BASE_STDDEV**2), np.inf)
+    if covariances is None:
+        return joint_stddev(positions, states, angle) ** 2
+    stated = covariances.trace(axis1=1, axis2=2) / 3.0
+    usable = (states > TrackingState.NOT_TRACKED) & np.isfinite(positions).all(axis=1) & (stated > 0.0)
+    variance: FloatArray = np.where(usable, np.maximum(stated, BASE_STDDEV**2), np.inf)
     return variance

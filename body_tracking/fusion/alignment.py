@@ -111,7 +111,7 @@ class SensorAlignment(PlacedSensors[_Sensor]):
             return None
         source.forget_before(stamp - _KEEP)
         if skeleton.covariances is not None:  # no Kinect
-            self._sides.sided.add(sensor)
+            self._sides.reliable.add(sensor)
         seen = _in_world(skeleton, stamp, pose)
         if source.newest is None or stamp > source.newest.stamp_ns:
             source.newest = seen
@@ -175,7 +175,7 @@ def _in_world(skeleton: Skeleton, stamp_ns: int, pose: SensorPose) -> _Frame:
     positions = np.where(known[:, None], skeleton.positions, np.nan)
     states = np.where(known, skeleton.states, 0)
     angle = viewing_angle(positions)
-    variance = joint_variance(skeleton, angle)
+    variance = joint_variance(positions, states, skeleton.covariances, angle)
     placed = pose.apply(positions)
     headings, weights = headings_of(placed), heading_weights(placed, variance)
     return _Frame(stamp_ns, placed, variance, states, float(angle), headings, weights, skeleton.body)

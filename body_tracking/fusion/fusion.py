@@ -184,7 +184,7 @@ class Fusion(PlacedSensors[_Sensor]):
         if sensor == self.reference:
             self._restart_behind(stamp, now_ns)
         if skeleton.covariances is not None:  # no Kinect
-            self._sides.sided.add(sensor)
+            self._sides.reliable.add(sensor)
         # Frames are remembered before the sensor is calibrated, so that it is known by then when its next one is due.
         self._remember(source, skeleton, stamp)
         if source.pose(stamp) is None:
@@ -230,7 +230,7 @@ class Fusion(PlacedSensors[_Sensor]):
             velocities = np.zeros((N_JOINTS, 3))
             since = stamp
         angle = viewing_angle(positions)
-        variance = joint_variance(skeleton, angle)
+        variance = joint_variance(positions, states, skeleton.covariances, angle)
         source.frames.append(
             _Frame(skeleton.stamp_ns, positions, velocities, variance, states, float(angle), skeleton.body, since)
         )

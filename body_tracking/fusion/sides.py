@@ -121,12 +121,12 @@ class Sides:
         hold: longest time for which a reversal that all sensors see at once is rejected, seconds.
 
     Attributes:
-        sided: sensors that tell left from right also from behind, as a mesh and the networks behind a camera do and a
-            Kinect does not: a reversal that they see is rejected for no longer than :data:`MIN_HOLD`.
+        reliable: sensors whose left and right are right from behind, too, unlike a Kinect's: a reversal that they see
+            is rejected for no longer than :data:`MIN_HOLD`.
     """
 
     def __init__(self, hold: float = HOLD) -> None:
-        self.sided: set[str] = set()
+        self.reliable: set[str] = set()
         self._hold_ns = round(hold * NANOSECONDS)
         self._least_ns = min(round(MIN_HOLD * NANOSECONDS), self._hold_ns)
         self.reset()
@@ -242,7 +242,9 @@ class Sides:
             for half in self._halves:
                 half.predict((stamp - self._headings_ns) / NANOSECONDS)
             senses = {index: self._sense(headings[index], weights[index]) for index in known}
-            if self._reversal_accepted(stamp, leading, senses, angles[leading], sided=names[leading] in self.sided):
+            if self._reversal_accepted(
+                stamp, leading, senses, angles[leading], reliable=names[leading] in self.reliable
+            ):
                 counters["reversals_accepted"] += 1
                 for half in self._halves:
                     half.angle += math.pi
@@ -315,7 +317,7 @@ class Sides:
         return leading
 
     def _reversal_accepted(
-        self, stamp: int, leading: int, senses: Mapping[int, float], angle: float, *, sided: bool
+        self, stamp: int, leading: int, senses: Mapping[int, float], angle: float, *, reliable: bool
     ) -> bool:
         """Whether the estimate was reversed, now that the trusted sensor sees the body reversed.
 
@@ -332,7 +334,7 @@ class Sides:
         since = self._reversed_since
         if since is None:
             since = self._reversed_since = stamp
-        held = self._least_ns if sided else min(max(since - self._known_since, self._least_ns), self._hold_ns)
+        held = self._least_ns if reliable else min(max(since - self._known_since, self._least_ns), self._hold_ns)
         if stamp - since <= held:
             return False
         self._known_since, self._reversed_since = self._known_from(since, angle), None

@@ -73,7 +73,7 @@ class Wrists(Running):
             topics=f"[/kinect1/skeleton,/forearm_left/imu/mag,{','.join(raw)}]",
             on_end="idle",
             start_paused=True,
-            rate=0.6,  # at full speed a busy machine leaves frames out
+            rate=0.5,  # at full speed a busy machine leaves frames out
         )
         self.links = {
             "bag_player": {graph.CLOCK_TOPIC: 10, "/kinect1/skeleton": 4, "/forearm_left/imu/mag": 1}
@@ -122,7 +122,7 @@ def test_forearms_come_out_oriented_in_world_and_in_the_cameras_clock(wrists: Wr
     for segment, messages in wrists.orientations.items():
         end = stamps[-1] if segment == "forearm_left" else stamps[0] + OFF_FROM
         measured = [message_to_orientation(message, segment) for message in messages]
-        assert len(measured) > 100, wrists.diagnostics  # a busy machine leaves some out
+        assert len(measured) > 150, wrists.diagnostics
         assert all(each.frame_id == "world" for each in measured)
         assert stamps[0] - 0.1 < measured[0].stamp_ns / NANOSECONDS < measured[-1].stamp_ns / NANOSECONDS < end + 0.1
         assert (np.diff([each.stamp_ns for each in measured]) > 0).all()

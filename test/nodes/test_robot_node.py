@@ -279,9 +279,11 @@ def test_commands_are_within_every_limit_and_jump_nowhere(run: Run) -> None:
         stood_at = np.array([at for at, _ in arm.stood])
         stood = np.array([position for _, position in arm.stood])
         for after in 1 + np.flatnonzero((steps > arm.mapping.rate * 2 * PERIOD + 1e-9).any(axis=1)):
-            lately = stood[np.abs(stood_at - arm.commands[after][0]) < 0.5]
-            assert (commanded[after] >= lately.min(axis=0) - 0.05).all(), (after, commanded[after], lately)
-            assert (commanded[after] <= lately.max(axis=0) + 0.05).all(), (after, commanded[after], lately)
+            before = arm.commands[after][0] - stood_at
+            lately = stood[(before >= 0.0) & (before < 0.5)]
+            margin = arm.mapping.rate * 2 * PERIOD + 0.05
+            assert (commanded[after] >= lately.min(axis=0) - margin).all(), (after, commanded[after], lately)
+            assert (commanded[after] <= lately.max(axis=0) + margin).all(), (after, commanded[after], lately)
 
 
 @pytest.mark.alone
@@ -413,8 +415,9 @@ def test_an_arm_follows_two_sensors_through_the_whole_graph_and_holds_when_they_
         assert re.search(rf"\| robot ({'|'.join(State)})", robots.log("up"))  # the status line, every 5 s
         assert stop(up) == 0, robots.log("up")
     (robot_log,) = [path.read_text() for path in tmp_path.glob("*/robot_commands.log")]
-    # How late the angles come, here and at the robot's node, depends on the machine and changes within a second: a
-    # command is one that the angles of half a second around it asked for. While it held and came back it is none.
+    # How late the angles come, here and at the robot's node, depends on the machine and changes within a second. So a
+    # command has to lie between the least and the largest that the angles asked for within half a second of it; those
+    # made while the robot held and came back are left out.
     came = np.array([each[0] for each in followed])
     while_following = np.any([(came > begin) & (came < end) for begin, end in following(robot_log)], axis=0)
     assert while_following.sum() > 200, robot_log
