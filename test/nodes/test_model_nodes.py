@@ -100,7 +100,8 @@ class Tracking(Running):
 
     def silence(self, seconds: float) -> None:
         """Sensors that send nothing while their time goes on: frames within the time that the filter has predicted
-        already come too late for it."""
+        already come too late for it.
+        """
         self.until(lambda: False, seconds)
         self.at += round(seconds * 60)
 
