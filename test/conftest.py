@@ -130,6 +130,14 @@ def wave(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def t_pose(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its first 4 s, for commands that need only run."""
+    from excerpts import beginning
+
+    return _made_once(tmp_path_factory, "t_pose", lambda bag: beginning(ROOT / "bags" / "tpose_wave", bag, 4.0))
+
+
+@pytest.fixture(scope="session")
 def replayed_wave(tmp_path_factory: pytest.TempPathFactory, wave: Path) -> Path:
     """The bag that the offline graph makes of ``wave`` with its default settings."""
     from body_tracking.recording.replay import ReplaySettings, replay

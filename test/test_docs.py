@@ -57,14 +57,14 @@ SLOW = dict.fromkeys(("reading_uncertainty", "choosing_a_filter", "markers"), py
         if commands(page)
     ],
 )
-def test_commands_of_the_documentation_work(page: Path, tmp_path: Path, wave: Path) -> None:
+def test_commands_of_the_documentation_work(page: Path, tmp_path: Path, t_pose: Path) -> None:
     for item in ROOT.iterdir():
         if not item.name.startswith(".") and item.name != "bags":
             (tmp_path / item.name).symlink_to(item)
     (tmp_path / "bags").mkdir()
     for bag in (ROOT / "bags").iterdir():
         short = bag.name == "tpose_wave" and not ALL
-        (tmp_path / "bags" / bag.name).symlink_to(wave if short else bag)
+        (tmp_path / "bags" / bag.name).symlink_to(t_pose if short else bag)
     for language, text in blocks(page):
         name = FILE.match(text)
         if language != "sh" and name:

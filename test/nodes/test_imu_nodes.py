@@ -29,6 +29,9 @@ from body_tracking.simulation.bags import write_bag  # noqa: E402
 from body_tracking.simulation.layouts import around  # noqa: E402
 from body_tracking.simulation.scene import Setup, simulate  # noqa: E402
 
+# A graph that tracks by inertial sensors keeps pace with a recording or loses by it.
+pytestmark = pytest.mark.alone
+
 FOREARMS = ("forearm_left", "forearm_right")
 OFF_FROM = 8.5
 SETTLED = 4.0
