@@ -116,7 +116,7 @@ def recorded() -> tuple[dict[str, live.Stream], dict[str, SensorPose]]:
             poses[pose.sensor] = pose
         for message in reader.messages([graph.TRUE_CLOCK]):
             sensor, _, clocks[sensor] = time_reference_to_clock(deserialize(TIME_REFERENCE, message.cdr))
-    return {name: live.Stream(own, clocks[name]) for name, own in frames.items()}, poses
+    return live.streams(frames, clocks), poses
 
 
 def events(streams: Mapping[str, live.Stream], relays: bool = True) -> Iterator[live.Event]:

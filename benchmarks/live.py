@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -296,21 +297,41 @@ def percentiles(delays: FloatArray, what: str, late: int = 99) -> dict[str, floa
 
 
 class Stream:
-    """What one sensor saw, by time: frames that were lost must not put two sensors out of step.
+    """What one sensor saw, by time: between two frames, points are interpolated, since the calibration would find the
+    clock of a sensor whose frames show what was before or after their stamps.
 
     Args:
         frames: (n,) the bodies in each frame.
         clock: of the sensor.
-        back: play it backwards after its end, so that nobody jumps, instead of anew.
+        span: first and last time that all sensors saw, nanoseconds by the reference's clock, played forwards, then
+            backwards, so that nobody jumps.
     """
 
-    def __init__(self, frames: Sequence[Sequence[Skeleton]], clock: ClockModel, back: bool = False) -> None:
-        self._messages = [bytearray(encode_skeletons(skeletons)) for skeletons in frames]
+    def __init__(self, frames: Sequence[Sequence[Skeleton]], clock: ClockModel, span: tuple[int, int]) -> None:
+        self._frames = frames
         self._times = np.array([clock.to_reference(skeletons[0].stamp_ns) for skeletons in frames])
-        self._back = back
+        self._span = span
 
     def at(self, seconds: float) -> bytearray:
-        """The message of the frame nearest to a time since the start."""
-        first, length = int(self._times[0]), int(self._times[-1] - self._times[0])
-        way = round(seconds * NANOSECONDS) % ((1 + self._back) * length)
-        return self._messages[int(np.abs(self._times - first - min(way, 2 * length - way)).argmin())]
+        """The message of a time since the start."""
+        first, length = self._span[0], self._span[1] - self._span[0]
+        way = round(seconds * NANOSECONDS) % (2 * length)
+        at = first + min(way, 2 * length - way)
+        after = int(np.clip(np.searchsorted(self._times, at), 1, len(self._times) - 1))
+        share = (at - self._times[after - 1]) / (self._times[after] - self._times[after - 1])
+        earlier, later = self._frames[after - 1], self._frames[after]
+        nearest = later if share > 0.5 else earlier
+        if [each.body for each in earlier] != [each.body for each in later]:
+            return bytearray(encode_skeletons(nearest))
+        between = [
+            replace(each, positions=(1.0 - share) * a.positions + share * b.positions)
+            for each, a, b in zip(nearest, earlier, later, strict=True)
+        ]
+        return bytearray(encode_skeletons(between))
+
+
+def streams(frames: Mapping[str, Sequence[Sequence[Skeleton]]], clocks: Mapping[str, ClockModel]) -> dict[str, Stream]:
+    """What each sensor saw of the time that all of them saw."""
+    ends = [[clocks[name].to_reference(own[index][0].stamp_ns) for name, own in frames.items()] for index in (0, -1)]
+    span = (max(ends[0]), min(ends[1]))
+    return {name: Stream(own, clocks[name], span) for name, own in frames.items()}

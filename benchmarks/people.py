@@ -204,12 +204,9 @@ def real(file: Path, folder: Path) -> dict[str, Any]:
 
 def streams_of(recording: SimulatedRecording) -> dict[str, live.Stream]:
     """What each sensor saw, to and fro."""
-    found = {}
-    for sensor in recording.sensors:
-        name = sensor.pose.sensor
-        frames = [frame.skeletons for frame in recording.frames if frame.sensor == name]
-        found[name] = live.Stream(frames, sensor.clock, back=True)
-    return found
+    names = [sensor.pose.sensor for sensor in recording.sensors]
+    frames = {name: [frame.skeletons for frame in recording.frames if frame.sensor == name] for name in names}
+    return live.streams(frames, {sensor.pose.sensor: sensor.clock for sensor in recording.sensors})
 
 
 class Ear(live.Bench):
