@@ -23,6 +23,10 @@ MOVING: Final = 2
 """A disc that moves while the shutter is open; x, y, radius, brightness, and the way in x and y."""
 
 _ITERATIONS: Final = 30
+_ROUNDS: Final = 10
+"""Of Lloyd's method."""
+_HOPELESS: Final = 200.0
+"""Weighted sum of squares by which a model is so much worse than another one that nothing of it counts."""
 _EXPECTED_EDGE: Final = 0.8
 """Standard deviation of the edge's blur, pixels: the expected value and"""
 _EDGE_RANGE: Final = 0.4
@@ -331,8 +335,45 @@ def _solve(information: FloatArray, damping: float, pull: FloatArray, lower: Flo
 
 
 @compiled
+def clusters(x: FloatArray, y: FloatArray, weights: FloatArray, count: int, along: FloatArray) -> FloatArray:
+    """Centres (count, 2) of clusters by Lloyd's method, from an even spread along a direction.
+
+    Args:
+        x: (n,) of the pixels.
+        y: (n,) of the pixels.
+        weights: (n,) of the pixels.
+        count: of clusters.
+        along: (2,) the direction.
+    """
+    order = np.argsort(x * along[0] + y * along[1])
+    centres, total = np.empty((count, 2)), weights.sum()
+    rank, share = 0, weights[order[0]]
+    for i in range(count):
+        while share < (i + 0.5) / count * total and rank < len(order) - 1:
+            rank += 1
+            share += weights[order[rank]]
+        centres[i, 0], centres[i, 1] = x[order[rank]], y[order[rank]]
+    sums = np.empty((count, 3))
+    for _ in range(_ROUNDS):
+        sums[:] = 0.0
+        for n in range(len(x)):
+            nearest, least = 0, np.inf
+            for i in range(count):
+                distance = (x[n] - centres[i, 0]) ** 2 + (y[n] - centres[i, 1]) ** 2
+                if distance < least:
+                    nearest, least = i, distance
+            sums[nearest, 0] += weights[n] * x[n]
+            sums[nearest, 1] += weights[n] * y[n]
+            sums[nearest, 2] += weights[n]
+        for i in range(count):
+            centres[i, 0] = sums[i, 0] / max(sums[i, 2], 1e-9)
+            centres[i, 1] = sums[i, 1] / max(sums[i, 2], 1e-9)
+    return centres
+
+
+@compiled
 def fit(
-    kind: int, start: FloatArray, pixels: FloatArray, ceiling: float
+    kind: int, start: FloatArray, pixels: FloatArray, ceiling: float, rival: float
 ) -> tuple[FloatArray, FloatArray, float, float]:
     """The most likely parameters of a model.
 
@@ -341,6 +382,8 @@ def fit(
         start: (p - 1,) its parameters but for the edge's.
         pixels: (4, n) x, y, brightness and its variance, of each pixel.
         ceiling: brightness at which the sensor saturates.
+        rival: weighted sum of squares of another model of these pixels; infinite where there is none. The fit ends
+            where it would stay far worse even if each further iteration gained as much as the last one.
 
     Returns:
         The parameters (p,), their information (p, p), the weighted sum of squared differences and the plain one.
@@ -355,7 +398,7 @@ def fit(
     tried_information, tried_pull = np.empty((size, size)), np.empty(size)
     damping = 1e-3
     squares, plain = _linear(kind, found, pixels, ceiling, information, pull)
-    for _ in range(_ITERATIONS):
+    for iteration in range(1, _ITERATIONS + 1):
         tried = np.empty(size)
         _solve(information, damping, pull, lower, tried)
         for i in range(size):
@@ -368,7 +411,8 @@ def fit(
         tried[-1] = min(max(tried[-1], math.log(_LEAST_EDGE)), math.log(_MOST_EDGE))
         now, now_plain = _linear(kind, tried, pixels, ceiling, tried_information, tried_pull)
         if now < squares:
-            done = squares - now < 1e-3 * max(squares, 1.0)
+            gain = squares - now
+            done = gain < 1e-3 * max(squares, 1.0) or now - (_ITERATIONS - iteration) * gain > rival + _HOPELESS
             found, squares, plain, damping = tried, now, now_plain, max(0.2 * damping, 1e-7)
             information, tried_information = tried_information, information
             pull, tried_pull = tried_pull, pull

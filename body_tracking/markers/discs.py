@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from body_tracking.core.skeleton import FloatArray
-from body_tracking.markers.disc_fit import CUT, MOVING, OVERLAPPING, fit
+from body_tracking.markers.disc_fit import CUT, MOVING, OVERLAPPING, clusters, fit
 
 MOST_DISCS: Final = 4
 """That are fitted together."""
@@ -69,11 +69,16 @@ def explain(pixels: FloatArray, ceiling: float, starts: FloatArray) -> Discs:
         return _several(starts, radius, pixels, ceiling)
     middle, (along, across), lengths, lopsided = _shape(x, y, weights)
     overlap: dict[int, Discs] = {}
+    single: list[Discs] = []
+
+    def least() -> float:
+        # weighted sum of squares of the best model so far
+        return min((discs.squares for discs in (*overlap.values(), *single)), default=np.inf) * len(x)
 
     def try_discs(count: int) -> Discs:
         # discs that share a part of their area
         radius = np.sqrt(1.5 * area / np.pi / count)
-        overlap[count] = _several(_cluster(x, y, weights, count, along), radius, pixels, ceiling)
+        overlap[count] = _several(clusters(x, y, weights, count, along), radius, pixels, ceiling, least())
         return overlap[count]
 
     # what is as wide as it is long is three balls rather than two
@@ -81,12 +86,13 @@ def explain(pixels: FloatArray, ceiling: float, starts: FloatArray) -> Discs:
         if try_discs(count).squares < _CONVINCING:
             return overlap[count]
     way = np.sqrt(12.0 * (lengths[0] ** 2 - lengths[1] ** 2)) * along
-    single = [_single(MOVING, [*middle, 2.0 * lengths[1], 1.0, *way], pixels, ceiling)]
+    single.append(_single(MOVING, [*middle, 2.0 * lengths[1], 1.0, *way], pixels, ceiling, least()))
     # the flat side of a disc that is cut is opposite to its tail; where it is small noise decides
     for hidden in (-np.copysign(1.0, lopsided) * across, np.copysign(1.0, lopsided) * across):
         whole = 2.0 * lengths[0]
         centre = middle + 0.3 * whole * hidden
-        single.append(_single(CUT, [*centre, whole, 1.0, np.arctan2(hidden[1], hidden[0]), 0.0], pixels, ceiling))
+        cut = [*centre, whole, 1.0, np.arctan2(hidden[1], hidden[0]), 0.0]
+        single.append(_single(CUT, cut, pixels, ceiling, least()))
         if single[-1].squares < _CONVINCING:
             break
     for count in range(3, MOST_DISCS + 1):
@@ -135,25 +141,11 @@ def _shape(x: FloatArray, y: FloatArray, weights: FloatArray) -> tuple[FloatArra
     return middle, directions, np.sqrt(np.maximum(values[::-1], 0.01)), float(weights @ (directions[1] @ offset) ** 3)
 
 
-def _cluster(x: FloatArray, y: FloatArray, weights: FloatArray, count: int, along: FloatArray) -> FloatArray:
-    """Centres (count, 2) of clusters by Lloyd's method, from an even spread along the longest direction."""
-    points = np.stack([x, y], axis=1)
-    place = points @ along
-    order = np.argsort(place)
-    share = np.cumsum(weights[order]) / weights.sum()
-    centres = points[order[np.searchsorted(share, (np.arange(count) + 0.5) / count)]]
-    for _ in range(10):
-        owner = np.linalg.norm(points[:, None] - centres, axis=2).argmin(axis=1)
-        total = np.maximum(np.bincount(owner, weights, count), 1e-9)
-        centres = np.stack([np.bincount(owner, weights * axis, count) / total for axis in (x, y)], axis=1)
-    return centres
-
-
-def _several(starts: FloatArray, radius: float, pixels: FloatArray, ceiling: float) -> Discs:
+def _several(starts: FloatArray, radius: float, pixels: FloatArray, ceiling: float, rival: float = np.inf) -> Discs:
     """Discs that overlap or are near to each other, from centres (k, 2) and a common radius."""
     count = len(starts)
     start = np.array([number for place in starts for number in (*place, radius, 1.0)])
-    found, covariance, *quality = _fit(OVERLAPPING, start, pixels, ceiling)
+    found, covariance, *quality = _fit(OVERLAPPING, start, pixels, ceiling, rival)
     discs = found[:-1].reshape(count, 4)
     blocks = np.stack([covariance[4 * i : 4 * i + 2, 4 * i : 4 * i + 2] for i in range(count)])
     centres, radii = discs[:, :2], discs[:, 2]
@@ -164,18 +156,18 @@ def _several(starts: FloatArray, radius: float, pixels: FloatArray, ceiling: flo
     return Discs(centres, radii, blocks, *quality)
 
 
-def _single(kind: int, start: list[float], pixels: FloatArray, ceiling: float) -> Discs:
+def _single(kind: int, start: list[float], pixels: FloatArray, ceiling: float, rival: float) -> Discs:
     """One disc, whose centre and radius are the first three parameters of the model."""
-    found, covariance, *quality = _fit(kind, np.array(start), pixels, ceiling)
+    found, covariance, *quality = _fit(kind, np.array(start), pixels, ceiling, rival)
     return Discs(found[None, :2], found[2:3], covariance[None, :2, :2], *quality)
 
 
 def _fit(
-    kind: int, start: FloatArray, pixels: FloatArray, ceiling: float
+    kind: int, start: FloatArray, pixels: FloatArray, ceiling: float, rival: float
 ) -> tuple[FloatArray, FloatArray, float, float, float]:
     """Parameters (p,), their covariance (p, p), and the qualities of :class:`Discs`."""
-    found, information, squares, plain = fit(kind, start, pixels, ceiling)
+    found, information, squares, plain = fit(kind, start, pixels, ceiling, rival)
     size, count = len(found), pixels.shape[1]
-    inverse: FloatArray = np.asarray(np.linalg.pinv(information + 1e-9 * np.eye(size)), dtype=np.float64)
+    inverse: FloatArray = np.asarray(np.linalg.pinv(information + 1e-9 * np.eye(size), hermitian=True), np.float64)
     covariance = max(1.0, squares / max(count - size, 1)) * inverse
     return found, covariance, float(np.sqrt(plain / count)), squares / count, squares + size * float(np.log(count))

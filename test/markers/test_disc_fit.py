@@ -54,7 +54,7 @@ def test_a_fit_finds_the_parameters_that_made_the_pixels(name: str) -> None:
     values = [brightness(kind, *place, p)[0] for place in zip(x.ravel(), y.ravel(), strict=True)]
     pixels = np.stack([x.ravel(), y.ravel(), np.array(values), np.full(x.size, 1e-4)])
     start = p[:-1] + np.random.default_rng(3).uniform(-0.1, 0.1, len(p) - 1)
-    found, information, _, plain = disc_fit.fit(kind, start, pixels, 10.0)
+    found, information, _, plain = disc_fit.fit(kind, start, pixels, 10.0, np.inf)
     assert found == pytest.approx(p, abs=1e-2)
     assert plain < 1e-4 * x.size * 0.01
     assert np.linalg.eigvalsh(information).min() > 0.0
