@@ -14,8 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from body_tracking.camera import registration
 from body_tracking.camera.pose_model import Landmark, Landmarks
 from body_tracking.core.camera import Camera
+from body_tracking.core.compiled import compiled
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray, Joint, SingleArray, Skeleton, TrackingState
 from body_tracking.mesh.depth import axial_noise
 
@@ -135,9 +137,8 @@ def lift(found: Landmarks, depth: SingleArray, camera: Camera) -> Lifted | None:
     present = np.min(np.where(_WEIGHTS > 0.0, found.present, 1.0), axis=1) > SEEN
     present &= camera.contains(pixels)
     expected = trunk + world[:, 2] - found.world[_TORSO, 2].mean()
-    surface, spread = np.full(len(_JOINTS), np.nan), np.zeros(len(_JOINTS))
-    for k in np.flatnonzero(present & (expected > _WINDOW)):
-        surface[k], spread[k] = _surface_near(depth, pixels[k], float(expected[k]), _WINDOW * focal / expected[k])
+    wanted = present & (expected > _WINDOW)
+    surface, spread = _surfaces(depth, pixels, expected, _WINDOW * focal / np.where(wanted, expected, 1.0), wanted)
     # where the network guesses, what is measured may be in front of the joint
     seen = np.isfinite(surface) & (visible > SEEN)
     rays = np.concatenate([camera.undistort(pixels), np.ones((len(pixels), 1))], axis=1)
@@ -239,15 +240,45 @@ def _trunk_mask(found: Landmarks, shape: tuple[int, ...]) -> BoolArray:
     return mask.astype(np.bool_)
 
 
-def _surface_near(depth: SingleArray, pixel: FloatArray, expected: float, radius: float) -> tuple[float, float]:
-    """Depth of the surface about a pixel and its scatter (RMS), metres; NaN where none is near the expected depth."""
-    (column, row), reach = np.round(pixel).astype(int), max(1, round(radius))
-    window = depth[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1]
-    there = window[np.abs(window - expected) < _EXPECTED].astype(np.float64)
-    if len(there) < _LEAST_PIXELS:
-        return np.nan, 0.0
-    surface = float(np.median(there))
-    return surface, float(np.sqrt(np.mean((there - surface) ** 2)))
+@compiled
+def _surfaces(
+    depth: SingleArray, pixels: FloatArray, expected: FloatArray, radii: FloatArray, wanted: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Depth of the surface about each pixel (n,) and its scatter (n,), RMS, metres; NaN and 0 where none is near the
+    expected depth (n,) within the radius (n,), pixels, or it is not wanted (n,).
+    """
+    surfaces, spreads = np.full(len(pixels), np.nan), np.zeros(len(pixels))
+    height, width = depth.shape
+    for k in range(len(pixels)):
+        if not wanted[k]:
+            continue
+        column, row = int(np.round(pixels[k, 0])), int(np.round(pixels[k, 1]))
+        reach = max(1, int(np.round(radii[k])))
+        top, bottom = max(row - reach, 0), min(row + reach + 1, height)
+        left, right = max(column - reach, 0), min(column + reach + 1, width)
+        if bottom <= top or right <= left:
+            continue
+        there, count = np.empty((bottom - top) * (right - left)), 0
+        for i in range(top, bottom):
+            for j in range(left, right):
+                if abs(depth[i, j] - expected[k]) < _EXPECTED:
+                    there[count] = depth[i, j]
+                    count += 1
+        if count < _LEAST_PIXELS:
+            continue
+        surfaces[k] = np.median(there[:count])
+        spreads[k] = np.sqrt(np.mean((there[:count] - surfaces[k]) ** 2))
+    return surfaces, spreads
+
+
+def prepare() -> None:
+    """Compile the loops of a camera's images, or load them, before the first one."""
+    registration.prepare()
+    ones = np.ones(1)
+    for writeable in (True, False):
+        depth = np.zeros((2, 2), np.float32)
+        depth.flags.writeable = writeable
+        _surfaces(depth, np.zeros((1, 2)), ones, ones, ones > 0.0)
 
 
 def _whole(positions: FloatArray, covariances: FloatArray, seen: BoolArray, known: BoolArray) -> Lifted:

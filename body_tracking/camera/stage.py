@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from body_tracking.camera.codecs import ColourImage, CompressedColour, CompressedDepth
-from body_tracking.camera.lifting import is_flat, lift
+from body_tracking.camera.lifting import is_flat, lift, prepare
 from body_tracking.camera.people import PersonTracker
 from body_tracking.camera.pictures import RATE, Pictures
 from body_tracking.camera.pose_model import ImageArray, Landmarks
@@ -88,6 +88,7 @@ class CameraStage(Stage):
 
     def __init__(self, values: Mapping[str, Value], wanted: Callable[[str], bool] = lambda topic: True) -> None:
         super().__init__(values, wanted)
+        prepare()
         names = tuple(check_sensor_name(each) for each in names_in(values["cameras"]))
         if not names or len(set(names)) < len(names):
             raise graph.GraphError(f"cameras: {', '.join(names) or 'none'}; expected one or more, each once")
