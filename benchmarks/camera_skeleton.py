@@ -73,11 +73,12 @@ INSIDE = 7.815
 ALL = "nothing"
 
 
-def _without_scatter(*args: Any) -> tuple[float, float]:
-    return _SURFACE_NEAR(*args)[0], 0.0
+def _without_scatter(*args: Any) -> tuple[FloatArray, FloatArray]:
+    surfaces, spreads = _SURFACES(*args)
+    return surfaces, 0.0 * spreads
 
 
-_SURFACE_NEAR = lifting._surface_near
+_SURFACES = lifting._surfaces
 _SURE = "_SURE"
 """Landmarks that the network guesses are lifted like others."""
 ABLATION: Mapping[str, Mapping[str, Any]] = {
@@ -90,7 +91,7 @@ ABLATION: Mapping[str, Mapping[str, Any]] = {
         "_DISPLACED": np.zeros(len(lifting._DISPLACED)),
         "_TRUNK": {joint: (*weights, 0.0) for joint, (*weights, _) in lifting._TRUNK.items()},
     },
-    "scatter of the surface": {"_surface_near": _without_scatter},
+    "scatter of the surface": {"_surfaces": _without_scatter},
     "doubt where depths disagree": {"_DISAGREED": 0.0},
     "spine in the trunk's mask": {"_SPINE": 0.0},
     "far shoulder and hip by the near ones": {"_TURNED": (10.0, 11.0)},

@@ -138,7 +138,9 @@ def lift(found: Landmarks, depth: SingleArray, camera: Camera) -> Lifted | None:
     present &= camera.contains(pixels)
     expected = trunk + world[:, 2] - found.world[_TORSO, 2].mean()
     wanted = present & (expected > _WINDOW)
-    surface, spread = _surfaces(depth, pixels, expected, _WINDOW * focal / np.where(wanted, expected, 1.0), wanted)
+    surface, spread = _surfaces(
+        depth, pixels, expected, _EXPECTED, _WINDOW * focal / np.where(wanted, expected, 1.0), wanted
+    )
     # where the network guesses, what is measured may be in front of the joint
     seen = np.isfinite(surface) & (visible > SEEN)
     rays = np.concatenate([camera.undistort(pixels), np.ones((len(pixels), 1))], axis=1)
@@ -242,10 +244,10 @@ def _trunk_mask(found: Landmarks, shape: tuple[int, ...]) -> BoolArray:
 
 @compiled
 def _surfaces(
-    depth: SingleArray, pixels: FloatArray, expected: FloatArray, radii: FloatArray, wanted: BoolArray
+    depth: SingleArray, pixels: FloatArray, expected: FloatArray, near: float, radii: FloatArray, wanted: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Depth of the surface about each pixel (n,) and its scatter (n,), RMS, metres; NaN and 0 where none is near the
-    expected depth (n,) within the radius (n,), pixels, or it is not wanted (n,).
+    """Depth of the surface about each pixel (n,) and its scatter (n,), RMS, metres; NaN and 0 where none is ``near``
+    the expected depth (n,), metres, within the radius (n,), pixels, or it is not wanted (n,).
     """
     surfaces, spreads = np.full(len(pixels), np.nan), np.zeros(len(pixels))
     height, width = depth.shape
@@ -261,7 +263,7 @@ def _surfaces(
         there, count = np.empty((bottom - top) * (right - left)), 0
         for i in range(top, bottom):
             for j in range(left, right):
-                if abs(depth[i, j] - expected[k]) < _EXPECTED:
+                if abs(depth[i, j] - expected[k]) < near:
                     there[count] = depth[i, j]
                     count += 1
         if count < _LEAST_PIXELS:
@@ -278,7 +280,7 @@ def prepare() -> None:
     for writeable in (True, False):
         depth = np.zeros((2, 2), np.float32)
         depth.flags.writeable = writeable
-        _surfaces(depth, np.zeros((1, 2)), ones, ones, ones > 0.0)
+        _surfaces(depth, np.zeros((1, 2)), ones, _EXPECTED, ones, ones > 0.0)
 
 
 def _whole(positions: FloatArray, covariances: FloatArray, seen: BoolArray, known: BoolArray) -> Lifted:
