@@ -4,7 +4,8 @@ Poses of clusters by an unweighted fit (Umeyama 1991) of the mean shape, whose m
 
 - ``knee``: the hinge between the thigh's and the shank's cluster, and how far its axis in the thigh and in the shank
   turns between the first and the second half of the trial; the first bends it by 128 deg, the second by 86. The same by
-  the closed form (SARA), and over frames of a bend that is in both halves. ``floor``: RMS over that bend, in steps of
+  the closed form (SARA), over frames of a bend that is in both halves, and, for what the method itself errs by, of
+  every other frame against the rest. ``floor``: RMS over that bend, in steps of
   5 deg, of how far the shank is turned out of the hinge's plane in one half against the other. At one and the same bend
   it is what no hinge explains, nor any joint of one degree of freedom: the knee turns about its long axis, and the
   clusters move on the skin. No joint of one degree of freedom explains that, which shows the size of what is beyond a
@@ -132,6 +133,7 @@ def halves_of(thigh: list[TargetPose], shank: list[TargetPose], whole: Joint) ->
 
     found = {}
     for name, fit, pair in (
+        ("alternate frames", likely, (rows[::2], rows[1::2])),
         ("maximum likelihood", likely, parts),
         ("closed form", sara, parts),
         ("the same bend", likely, common_bend),
