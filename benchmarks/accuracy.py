@@ -34,6 +34,7 @@ from common import Mean
 from offline_graph import OfflineGraph
 from thesis_pipeline import EKF, LKF1, LKF2, run_thesis
 
+from body_tracking.core.measurement import BONE_CORRELATION
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, Skeleton, TrackingState
 from body_tracking.core.sources import RecordedFrame
@@ -175,9 +176,17 @@ def figures_of(run: Run, methods: Sequence[str] = METHODS) -> dict[str, Figures]
 
 
 def compared(
-    skeletons: Sequence[Skeleton], poses: Sequence[SensorPose], capsules: Capsules, curve: Curve, zero_ns: int
+    skeletons: Sequence[Skeleton],
+    poses: Sequence[SensorPose],
+    capsules: Capsules,
+    curve: Curve,
+    zero_ns: int,
+    of_bones: float = BONE_CORRELATION,
 ) -> Figures:
-    """Skeletons beside the true joints over seconds from a stamp, and the person's limbs as the sensors see them."""
+    """Skeletons beside the true joints over seconds from a stamp, and the person's limbs as the sensors see them.
+
+    ``of_bones`` is the parameter ``bone_correlation`` of ``joint_angles``.
+    """
     times = np.array([(each.stamp_ns - zero_ns) / NANOSECONDS for each in skeletons])
     first, last = curve.span
     inside = (times >= first) & (times <= last) & (np.diff(times, prepend=-np.inf) > 0.0)
@@ -189,7 +198,7 @@ def compared(
     own = np.einsum("njba,njb->nja", segment_frames(true), found - true) - errors.offset
     apart = np.linalg.norm(own, axis=-1)[:, TEN]
     hidden = _hidden(poses, capsules, true)[:, TEN] & np.isfinite(apart)
-    angles, stddev = _angles(skeletons)
+    angles, stddev = _angles(skeletons, of_bones)
     right, _ = _angles([_true_skeleton(each) for each in true])
     off = wrapped(angles - right)
     covered = np.where(np.isfinite(stddev), np.abs(off) <= common.NORMAL * stddev, np.nan)
@@ -226,9 +235,9 @@ def _true_skeleton(positions: FloatArray) -> Skeleton:
     return Skeleton(0, "world", positions, np.full(len(positions), TrackingState.TRACKED, dtype=np.uint8))
 
 
-def _angles(skeletons: Iterable[Skeleton]) -> tuple[FloatArray, FloatArray]:
+def _angles(skeletons: Iterable[Skeleton], of_bones: float = BONE_CORRELATION) -> tuple[FloatArray, FloatArray]:
     """(n, m) positional angles and their standard deviations, radians; NaN and infinity where there is none."""
-    found = [positional_angles(each) for each in skeletons]
+    found = [positional_angles(each, of_bones) for each in skeletons]
     return np.stack([each.position for each in found]), np.stack([each.position_stddev for each in found])
 
 

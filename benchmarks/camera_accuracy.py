@@ -34,6 +34,7 @@ from body_tracking.camera.people import PersonTracker
 from body_tracking.camera.pose_model import Landmark, Landmarks, PoseModel
 from body_tracking.core.camera import Camera
 from body_tracking.core.clocks import ClockModel
+from body_tracking.core.measurement import BONE_CORRELATION
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton
 from body_tracking.core.sources import RecordedFrame, optical_frame
 from body_tracking.evaluation.metrics import Curve
@@ -202,7 +203,9 @@ def figures_of(job: tuple[str, int, float, int]) -> dict[str, dict[str, float]]:
         for label, skeletons in outputs.items():
             some = [each for each in skeletons if each.stamp_ns >= begin]
             poses = [view.pose for view in views]
-            figures = compared(some, poses, who.person.capsules(), curve, START_NS)
+            # as `up` sets it
+            of_bones = BONE_CORRELATION if name == KINECTS else 0.0
+            figures = compared(some, poses, who.person.capsules(), curve, START_NS, of_bones)
             found[f"{name}, {label}"] = {**own[name], **{key: getattr(figures, key) for key in COLUMNS}}
     return found
 

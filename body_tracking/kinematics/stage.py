@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from typing import Any
 
 from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.measurement import BONE_CORRELATION
 from body_tracking.core.parameters import Parameter, Value
 from body_tracking.core.skeleton import Skeleton
 from body_tracking.kinematics.tracking import ALL_CONVENTIONS, AngleStream, state_estimate
@@ -33,6 +34,15 @@ ANGLES = (
         choices=(graph.AUTO, graph.SKELETON_INPUT, graph.MODEL_INPUT),
         live=True,
     ),
+    Parameter(
+        "bone_correlation",
+        BONE_CORRELATION,
+        "correlation of the errors of the two joints of a bone, for the deviations of positional angles: the default "
+        "is a Kinect's; 0 for joints with independent errors, as those of cameras",
+        min=0.0,
+        max=0.99,
+        live=True,
+    ),
 )
 """The parameters of ``joint_angles`` that the offline graph has too."""
 
@@ -44,20 +54,23 @@ _UNPAIRED = 1000
 a resent message comes late."""
 
 
-def angle_streams(convention: str, body: str, people: PeopleParameters) -> dict[str, AngleStream]:
+def angle_streams(
+    convention: str, body: str, people: PeopleParameters, of_bones: float = BONE_CORRELATION
+) -> dict[str, AngleStream]:
     """Joint angles in one convention, of each person who may be tracked, by id.
 
     Args:
         convention: one of ``ALL_CONVENTIONS``.
         body: the id of one subject.
         people: whom to track.
+        of_bones: correlation of the errors of the two joints of a bone.
 
     Raises:
         ConventionError: unknown convention.
     """
     if people.subject != ALL:
-        return {body: AngleStream(convention)}
-    return {each: AngleStream(convention, _AWAY_S) for each in graph.bodies(people.people)}
+        return {body: AngleStream(convention, of_bones=of_bones)}
+    return {each: AngleStream(convention, _AWAY_S, of_bones) for each in graph.bodies(people.people)}
 
 
 def by_person(skeletons: Sequence[Skeleton], ids: Collection[str], *, several: bool) -> Iterator[tuple[str, Skeleton]]:
@@ -114,7 +127,8 @@ class AnglesStage(Stage):
         self.source = source if known or asked == graph.POSITIONAL else ""
         people = people_from(values)
         self._several = people.subject == ALL
-        self.streams = angle_streams(convention, graph.check_body(str(values["body"])), people)
+        of_bones = float(str(values["bone_correlation"]))
+        self.streams = angle_streams(convention, graph.check_body(str(values["body"])), people, of_bones)
         self._waiting = {body: OrderedDict() for body in self.streams}
         self._states: dict[str, str] = {}
         self._covariances: dict[str, str] = {}

@@ -16,6 +16,7 @@ from body_tracking.core import so3
 from body_tracking.core.body_model import ModelError
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.measurement import BONE_CORRELATION
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, Joint, Skeleton
 from body_tracking.kinematics.conventions import CONVENTIONS, ConventionError, angles_of, convention
 from body_tracking.kinematics.inverse import Fit, InverseKinematics
@@ -202,12 +203,13 @@ class AngleStream:
     Args:
         convention: one of ``ALL_CONVENTIONS``.
         forget_after: seconds without the person after which the next frame is of another one.
+        of_bones: correlation of the errors of the two joints of a bone, for positional angles.
 
     Raises:
         ConventionError: unknown convention.
     """
 
-    def __init__(self, convention: str, forget_after: float = math.inf) -> None:
+    def __init__(self, convention: str, forget_after: float = math.inf, of_bones: float = BONE_CORRELATION) -> None:
         if convention not in ALL_CONVENTIONS:
             raise ConventionError(f"angle convention {convention!r}: not one of {', '.join(ALL_CONVENTIONS)}")
         self.convention = convention
@@ -215,7 +217,7 @@ class AngleStream:
         self.fit = SkeletonFit(self.model)
         self._previous: JointAngles | None = None
         self._doubt = JumpDoubt()
-        self._forget_after_ns = forget_after * NANOSECONDS
+        self._forget_after_ns, self._of_bones = forget_after * NANOSECONDS, of_bones
 
     def reset(self) -> None:
         """Forget the person."""
@@ -227,7 +229,7 @@ class AngleStream:
         """Of one frame; None where the convention needs a model and no trunk is seen."""
         self._reset_after_gap(skeleton.stamp_ns)
         if self.convention == POSITIONAL:
-            self._previous = positional_angles(skeleton)
+            self._previous = positional_angles(skeleton, self._of_bones)
             return self._doubt(self._previous)
         estimate = self.fit.update(skeleton)
         return None if estimate is None else self.of_estimate(estimate)

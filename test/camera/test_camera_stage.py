@@ -21,6 +21,7 @@ from body_tracking.mesh.depth import DepthError
 from body_tracking.pipeline.graph import GraphError
 from body_tracking.pipeline.stage import Now, Output
 from body_tracking.simulation.camera_bags import SECONDS
+from body_tracking.systems import nodes_for, options_of
 from pose_networks import MISSING, REASON
 
 networks = pytest.mark.skipif(bool(MISSING), reason=REASON)
@@ -258,3 +259,12 @@ def test_states_say_what_is_seen() -> None:
     (skeleton,) = show(node, stamp_ns, down, low)
     assert (skeleton.states[SEEN[:2]] == TrackingState.TRACKED).all()
     assert skeleton.states[Joint.ANKLE_LEFT] == TrackingState.NOT_TRACKED
+
+
+def test_errors_of_neighbouring_joints_are_independent_where_cameras_are_alone() -> None:
+    def given(**options: tuple[str, ...]) -> object:
+        specs = {spec.name: spec for spec in nodes_for(options_of(**options))}
+        return specs["joint_angles"].defaults.get("bone_correlation", "as of Kinects")
+
+    assert given(camera=("camera1", "camera2")) == 0.0
+    assert given(sensors=("kinect1",), camera=("camera1",)) == given(depth=("kinect1",)) == "as of Kinects"
