@@ -86,7 +86,7 @@ demo-camera: $(STAMP) ## the same with colour and depth images: from the people 
 
 # The tests that compute, and lint, take what is left of the processors by those that start processes. These wait more than
 # they compute: four run at a time, and one at a time where they state how soon something happens (these first, since they
-# leave most). All of it runs, whatever fails. The workspace for test/ros2 is made before, and does not count as time of the tests.
+# leave most). All of it runs, whatever fails. What takes no workspace of ros2 goes on while that one is made, the first time.
 test: $(STAMP) ## formatting, lint, types and the tests, in five minutes
 	@$(call tests,not slow)
 
@@ -95,10 +95,10 @@ test-all: $(STAMP) $(SITE_VENV)/.installed ## the same with the longer draws and
 	@$(call tests,slow or not slow)
 
 define tests
-failed=; $(MAKE) --no-print-directory ros2-workspace || { failed=", the workspace of ros2"; export TEST_ROS2=failed; }; \
-phase() { name="$$1"; shift; echo "== $$name"; $(BIN)/python -m pytest "$$@" || failed="$$failed, $$name"; }; \
+failed=; phase() { name="$$1"; shift; echo "== $$name"; $(BIN)/python -m pytest "$$@" || failed="$$failed, $$name"; }; \
 nice -n 19 $(MAKE) --no-print-directory lint >$(VENV)/lint.txt 2>&1 & lint=$$!; \
 nice -n 19 $(BIN)/python -m pytest -m "($(1)) and not processes" --numprocesses 2 --dist worksteal >$(VENV)/compute.txt 2>&1 & compute=$$!; \
+$(MAKE) --no-print-directory ros2-workspace || { failed=", the workspace of ros2"; export TEST_ROS2=failed; }; \
 phase "tests of time" -m "($(1)) and processes and alone"; \
 phase "tests of processes" -m "($(1)) and processes and not alone" --numprocesses 4 --dist loadscope --no-loadscope-reorder; \
 echo "== tests that compute"; wait $$compute || failed="$$failed, tests that compute"; cat $(VENV)/compute.txt; \
