@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from body_tracking.camera import registration
 from body_tracking.camera.pose_model import Landmark, Landmarks
 from body_tracking.core.camera import Camera
 from body_tracking.core.compiled import compiled
@@ -274,8 +273,7 @@ def _surfaces(
 
 
 def prepare() -> None:
-    """Compile the loops of a camera's images, or load them, before the first one."""
-    registration.prepare()
+    """Compile the loop, or load it, before the first image."""
     ones = np.ones(1)
     for writeable in (True, False):
         depth = np.zeros((2, 2), np.float32)

@@ -10,8 +10,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from body_tracking.camera import lifting, registration
 from body_tracking.camera.codecs import ColourImage, CompressedColour, CompressedDepth
-from body_tracking.camera.lifting import is_flat, lift, prepare
+from body_tracking.camera.lifting import is_flat, lift
 from body_tracking.camera.people import PersonTracker
 from body_tracking.camera.pictures import RATE, Pictures
 from body_tracking.camera.pose_model import ImageArray, Landmarks
@@ -307,6 +308,12 @@ class ColourAndDepth:
                 self.counters[f"{what} images of another size"] += 1
                 self._problem = str(error)
                 raise
+
+
+def prepare() -> None:
+    """Compile the loops of a camera's images, or load them, before the first one."""
+    registration.prepare()
+    lifting.prepare()
 
 
 def topics_of(camera: str, values: Mapping[str, Value]) -> CameraTopics:

@@ -207,5 +207,5 @@ SYSTEM = System(
     commands=(
         Command("camera", "body_tracking.recording.camera_commands", "fetch the networks, and draw what they find"),
     ),
-    prepare="body_tracking.camera.lifting:prepare",
+    prepare="body_tracking.camera.stage:prepare",
 )
