@@ -41,7 +41,6 @@ ONE_AT_A_TIME = {
         "test_fifth_system.py",
         "test_up.py",
     ),
-    "robots": ("test_robot_safety.py",),
 }
 """Tests that start a dozen processes each, of which one of each kind runs at a time, before all others: several would
 starve each other while their nodes start."""
