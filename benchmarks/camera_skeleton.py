@@ -278,6 +278,11 @@ def main() -> int:
     for motion, each in runs[ALL].items():
         row(motion.ljust(width), each)
     row("all".ljust(width), total[ALL])
+    camera, kinect = (np.concatenate([getattr(each, name) for each in total[ALL]]) for name in ("errors", "kinect"))
+    print(
+        f"correlation of the errors at the two ends of a bone: {common.bone_correlation(camera, ARMS):.2f}, "
+        f"of the Kinect's {common.bone_correlation(kinect, ARMS):.2f}"
+    )
     if args.joints:
         errors, distances = (
             np.concatenate([getattr(each, name) for each in total[ALL]]) for name in ("errors", "distances")

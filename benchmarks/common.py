@@ -10,6 +10,7 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
+import itertools
 import json
 import multiprocessing
 import sys
@@ -160,6 +161,20 @@ def rms(values: FloatArray) -> float:
 def rms_deg(radians: FloatArray) -> float:
     """The same of angles, in degrees."""
     return float(np.degrees(rms(radians)))
+
+
+def bone_correlation(errors: FloatArray, joints: Sequence[int]) -> float:
+    """Correlation of the errors of the joints at the two ends of a bone, over its axes, as ``joint_angles`` takes it.
+
+    Args:
+        errors: (n, k, 3); NaN where a joint is not tracked.
+        joints: indices into ``errors`` of shoulder, elbow and wrist, one arm after the other.
+    """
+    pairs = [(a, b) for arm in zip(*[iter(joints)] * 3, strict=True) for a, b in itertools.pairwise(arm)]
+    one, other = (np.concatenate([errors[:, pair[end]].ravel() for pair in pairs]) for end in (0, 1))
+    known = np.isfinite(one) & np.isfinite(other)
+    one, other = one[known], other[known]
+    return float((one * other).sum() / np.sqrt((one**2).sum() * (other**2).sum()))
 
 
 def between(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -3,8 +3,9 @@
 Shoulders, elbows and wrists of ``mesh_tracker`` beside those of the simulated Kinect's skeleton, millimetres: the mean
 and the 95th percentile, as they are and without the constant offset of each joint. ``floor`` is the same fit of every
 tenth image started at the true joints. ``NEES`` is the mean squared error over the stated variance, per degree of
-freedom, ``in 1.96 sd`` the share of coordinates within 1.96 stated deviations. The time is that of the processor per
-image of 512x424 pixels, after the first, which searches for the person.
+freedom, ``in 1.96 sd`` the share of coordinates within 1.96 stated deviations. ``bone correlation``: of the
+errors of the joints at the two ends of a bone. The time is that of the processor per image of 512x424 pixels, after the
+first, which searches for the person.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import Any, NamedTuple
 
 import common
 import numpy as np
-from common import ABSENT, NORMAL, mapped, report, verdicts
+from common import ABSENT, NORMAL, bone_correlation, mapped, report, verdicts
 from mesh_runs import ARMS, fit_from_truth, is_absent, kinect_skeletons, mesh_stage, scene_of
 
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
@@ -116,6 +117,7 @@ def figures_of(runs: Sequence[Run]) -> dict[str, Any]:
     errors = np.concatenate([each.mesh for each in runs])
     covariance = np.concatenate([each.covariance for each in runs])
     found["nees"] = float(np.einsum("nja,njab,njb->nj", errors, np.linalg.inv(covariance), errors).mean() / 3.0)
+    found["bone correlation"] = bone_correlation(errors, range(len(ARMS)))
     spread = np.sqrt(np.diagonal(covariance, axis1=2, axis2=3))
     found["within"] = float((np.abs(errors) < NORMAL * spread).mean())
     found["ms"] = tuple(float(np.percentile(np.concatenate([each.ms for each in runs]), at)) for at in (50, 99))
@@ -141,6 +143,7 @@ def main() -> int:
         rows = {
             "NEES": lambda each: f"{each['nees']:.2f}",
             "in 1.96 sd": lambda each: f"{each['within']:.1%}",
+            "bone correlation": lambda each: f"{each['bone correlation']:.2f}",
             "lost of images": lambda each: f"{each['lost']} of {each['images']}",
             "ms, median and 99 %": lambda each: f"{each['ms'][0]:.1f}, {each['ms'][1]:.1f}",
         }
