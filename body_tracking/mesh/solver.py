@@ -154,6 +154,22 @@ class Fit:
     lost: bool
 
 
+def facing(course: FloatArray) -> FloatArray:
+    """(3, 3) rotation of the first joint of a person who stands upright and faces in a direction.
+
+    Args:
+        course: (3,) in the camera's frame, whose y axis is down.
+    """
+    turn = np.arctan2(-course[0], -course[2])
+    return so3.quat_to_matrix(so3.exp(np.array([0.0, turn, 0.0]))) @ FACING_CAMERA
+
+
+def is_along(pose: Pose, course: FloatArray) -> bool:
+    """Whether a body faces within 60 degrees of a direction (3,) in the horizontal plane."""
+    forward = pose.rotations[0, ::2, 2]
+    return bool(forward @ course[::2] > 0.5 * np.linalg.norm(forward) * np.linalg.norm(course[::2]))
+
+
 class MeshFitter:
     """Fits poses of one person's body.
 
@@ -276,12 +292,15 @@ class MeshFitter:
         )
         return np.asarray(behind @ self._below > _HIDDEN)
 
-    def search(self, observation: Observation, orientations: Sequence[Orientation] = ()) -> Fit:
+    def search(
+        self, observation: Observation, orientations: Sequence[Orientation] = (), course: FloatArray | None = None
+    ) -> Fit:
         """The best fit from several starts of a person who stands somewhere in view.
 
         Args:
             observation: of the person.
             orientations: of inertial sensors.
+            course: (3,) direction in which the person walks, any length; without one the person faces the camera.
         """
         head = observation.points[:, 1].min()
         middle = np.median(observation.points, axis=0)
@@ -290,6 +309,8 @@ class MeshFitter:
         fits = []
         for elevation, flexion in ((0.2, 0.2), (0.8, 0.3), (1.5, 0.1), (0.3, 1.4)):
             start = self.neutral(place, elevation, flexion)
+            if course is not None:
+                start.rotations[0] = facing(course)
             fits.append(self.fit(observation, start, orientations=orientations, scales=WIDE))
         return min(fits, key=lambda fit: (fit.lost, fit.energy))
 

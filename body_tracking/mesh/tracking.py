@@ -2,7 +2,8 @@
 
 Each image is fitted from where the last motion leads. A fit that is lost is tried again with a wide robust scale, from
 the last pose and from another sensor's skeleton where there is one; a person who stays lost is searched for anew, in
-the next candidate of a person's size each time.
+the next candidate of a person's size each time. A person who walks is expected to face that way: such starts are tried
+where the fit leaves points of the person unexplained.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from body_tracking.mesh.energy import Observation, observe
 from body_tracking.mesh.person import COVERED, NOBODY, REACH, PersonFinder, is_covered, near
 from body_tracking.mesh.personalisation import personalise
 from body_tracking.mesh.raster import render
-from body_tracking.mesh.solver import SCALES, WIDE, Fit, JointPoints, MeshFitter, Orientation, Prediction
+from body_tracking.mesh.solver import SCALES, WIDE, Fit, JointPoints, MeshFitter, Orientation, Prediction, is_along
 from body_tracking.mesh.uncertainty import kinect_landmarks, placed
 
 _RATES: Final = {"shoulder": 9.0, "elbow": 9.0, "wrist": 9.0, "collar": 3.0}
@@ -42,6 +43,11 @@ _LONGEST_S: Final = 0.2
 """Seconds between two images whose change of pose is a rate."""
 _SKELETON: Final = 0.08
 """Metres: standard deviation of the joints of another sensor's skeleton as a start."""
+_COURSE_S: Final = 0.5
+"""Seconds over which the velocity of a person who walks is measured."""
+_SLOWEST: Final = 0.35
+_FASTEST: Final = 3.0
+"""m/s, horizontally, of a person who walks; what is faster is another person."""
 _WHOLE: Final = 0.99
 """Share of points that belong to the body below which an arm may be elsewhere than fitted."""
 _EXPLAINED: Final = 0.97
@@ -133,6 +139,7 @@ class MeshTracker:
         self._lost_ns: int | None = None
         self._searched_ns: int | None = None
         self._arms_ns: int | None = None
+        self._places: list[tuple[int, FloatArray]] = []
         self._choice = 0
         self.problem = NOBODY
         self.observation: Observation | None = None
@@ -187,6 +194,9 @@ class MeshTracker:
             self.counters[self.problem] += 1
             self._forget(stamp_ns)
             return None
+        since_ns = stamp_ns - round(_COURSE_S * NANOSECONDS)
+        self._places = [each for each in self._places if since_ns <= each[0] < stamp_ns]
+        self._places.append((stamp_ns, np.median(self.observation.points, axis=0)))
         fit = self._fit(stamp_ns, self.observation, orientations, skeleton)
         if fit is None:
             return None
@@ -224,37 +234,62 @@ class MeshTracker:
             if not fit.lost:
                 return self._with_arms(stamp_ns, seen, orientations, fit)
             self.counters["second starts"] += 1
-            again = self._fitter.fit(seen, self._fits[-1][1].pose, None, orientations, points, WIDE)
-            return min(fit, again, key=lambda each: (each.lost, each.energy))
-        waiting = self.parameters.search_every * NANOSECONDS
-        if self._searched_ns is not None and 0 <= stamp_ns - self._searched_ns < waiting:
+            fits = [fit, self._fitter.fit(seen, self._fits[-1][1].pose, None, orientations, points, WIDE)]
+            course = self._course()
+            if course is not None and self._may_search(stamp_ns):
+                fits.append(self._fitter.search(seen, orientations, course))
+            return min(fits, key=lambda each: (each.lost, each.energy))
+        if not self._may_search(stamp_ns):
             self.problem = "searching"
             return None
-        self._searched_ns = stamp_ns
-        self.counters["searches"] += 1
-        fit = self._fitter.search(seen, orientations)
+        fit = self._fitter.search(seen, orientations, self._course())
         if points is not None and fit.lost:
             fit = self._fitter.fit(seen, fit.pose, None, orientations, points, WIDE)
         return fit
+
+    def _may_search(self, stamp_ns: int) -> bool:
+        """Whether the last search is long enough ago; then this counts as one."""
+        if self._waits(stamp_ns, self._searched_ns):
+            return False
+        self._searched_ns = stamp_ns
+        self.counters["searches"] += 1
+        return True
+
+    def _waits(self, stamp_ns: int, last_ns: int | None) -> bool:
+        """Whether what was last done at a time is not to be done again yet."""
+        return last_ns is not None and 0 <= stamp_ns - last_ns < self.parameters.search_every * NANOSECONDS
+
+    def _course(self) -> FloatArray | None:
+        """(3,) m/s of a person who walks, and so faces that way; None of one who may stand."""
+        (first_ns, first), (last_ns, last) = self._places[0], self._places[-1]
+        elapsed = (last_ns - first_ns) / NANOSECONDS
+        if elapsed < _COURSE_S / 5.0:
+            return None
+        velocity = (last - first) / elapsed
+        return velocity if _SLOWEST < np.hypot(velocity[0], velocity[2]) < _FASTEST else None
 
     def _with_arms(self, stamp_ns: int, seen: Observation, orientations: Sequence[Orientation], fit: Fit) -> Fit:
         """A fit, or a better one with the arms elsewhere.
 
         The trunk's surface holds an arm that it hid for some images: a start with hanging arms. A hand that was faster
-        than expected leaves points of the person unexplained: starts with a hand there.
+        than expected leaves points of the person unexplained: starts with a hand there, and those of a search
+        for somebody who walks.
         """
-        waiting = self.parameters.search_every * NANOSECONDS
-        waits = self._arms_ns is not None and 0 <= stamp_ns - self._arms_ns < waiting
         starts = [] if fit.matched >= _EXPLAINED else self._fitter.towards_unmatched(seen, fit)
         if starts:
             self.counters["starts with a hand elsewhere"] += 1
-        if fit.matched < _WHOLE and not waits:
+        if fit.matched < _WHOLE and not self._waits(stamp_ns, self._arms_ns):
             self._arms_ns = stamp_ns
             self.counters["starts with hanging arms"] += 1
             starts = [*starts, self._fitter.with_hanging_arms(fit.pose)]
-        if not starts:
-            return fit
         fits = [self._fitter.fit(seen, start, None, orientations) for start in starts]
+        course = self._course()
+        if fit.matched < _EXPLAINED and course is not None and self._may_search(stamp_ns):
+            found = self._fitter.search(seen, orientations, course)
+            # front and back look alike in depth, so what turns a tracked person away from the course is not believed
+            fits += [found] if is_along(found.pose, course) else []
+        if not fits:
+            return fit
         again = min(fits, key=lambda each: (each.lost, each.energy))
         here = self._fitter.evaluate(seen, fit.pose, SCALES[-1], None, orientations).fit
         return again if not again.lost and again.energy < here.energy else fit

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import cv2
@@ -15,6 +16,8 @@ from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, Tracking
 from body_tracking.mesh import body_model
 from body_tracking.mesh.depth import DepthCamera, DepthError, to_metres
 from body_tracking.mesh.person import COVERED, NOBODY, PersonFinder
+from body_tracking.mesh.raster import render
+from body_tracking.mesh.solver import MeshFitter, facing
 from body_tracking.mesh.tracking import MeshTracker, Tracked, prepare
 
 ARMS = [getattr(Joint, f"{name}_{side}") for side in ("LEFT", "RIGHT") for name in ("SHOULDER", "ELBOW", "WRIST")]
@@ -104,6 +107,26 @@ def test_furniture_of_a_persons_size_is_lost_and_searches_take_turns_in_time(tra
     # every 0.2 s, for a search takes as long as ten images
     assert tracker.counters["searches"] == 2 and tracker.counters["lost"] == 2
     assert tracker.problem == "searching"
+
+
+def test_a_person_who_walks_across_is_found_from_the_side_at_once_and_the_right_way_round() -> None:
+    """Starts that face the camera find such a person in the end, and lose them in between."""
+    body, wall, right = body_model.load().body(), np.full_like(NOTHING, 4.0), []
+    for side, elevation, flexion in itertools.product((-1.0, 1.0), (0.1, 0.15), (0.2, 0.4)):
+        tracker = MeshTracker(DepthCamera(recording().camera), body, np.eye(len(body.shape)))
+        fitter = MeshFitter(body)
+        tracker.update(0, wall)
+        for number in range(1, 31):
+            pose = fitter.neutral(np.array([side * (1.5 - 0.9 * number / 15), 0.0, 2.2]), elevation, flexion)
+            pose.rotations[0] = facing(np.array([-side, 0.0, 0.0]))
+            person = render(body.posed(pose).vertices, body.model.faces, recording().camera).depth
+            found = tracker.update(round(number / 15 * NANOSECONDS), np.where(person > 0.0, person, wall))
+            if found is not None:
+                across = found.points[Joint.SHOULDER_LEFT] - found.points[Joint.SHOULDER_RIGHT]
+                assert abs(np.degrees(np.arctan2(across[0], -side * across[2]))) < 30.0
+            if number > 3:
+                right.append(found is not None)
+    assert np.mean(right) > 0.95
 
 
 def test_the_person_of_the_body_index_is_tracked(tracker: MeshTracker) -> None:
