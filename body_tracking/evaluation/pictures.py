@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from body_tracking.core.skeleton import BONES, JOINT_NAMES, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from body_tracking.evaluation.comparison import MAX_GAP, AngleComparison, Evaluation
@@ -165,16 +167,25 @@ def _draw_angles(figure: Any, angles: AngleComparison, still: float = _STILL) ->
 
 
 def _draw_person(figure: Any, tracked: Tracked, start_ns: int) -> None:
-    """Stick figures at evenly spaced instants."""
+    """Stick figures at evenly spaced instants.
+
+    The true ones are moved to the same pelvis and turned by one angle about z, because their world may be another one.
+    """
     skeletons, truths = tracked.skeletons, tracked.true_skeletons
     chosen = [skeletons[n] for n in np.unique(np.linspace(0, len(skeletons) - 1, _INSTANTS).astype(int))]
     stamps, true = (np.array([each.stamp_ns for each in side], dtype=np.int64) for side in (chosen, truths))
     matches = nearest(true, stamps) if truths else np.full(len(chosen), -1)
-    axes, view = figure.subplots(1, len(chosen), sharex=True, sharey=True, squeeze=False)[0], _view(chosen)
+    axes, heading = figure.subplots(1, len(chosen), sharex=True, sharey=True, squeeze=False)[0], _heading(chosen)
+    view = _view(heading)
+    pairs = [(skeleton, truths[match]) for skeleton, match in zip(chosen, matches, strict=True) if match >= 0]
+    true_view = _view(heading + _turn(pairs))
     for axis, skeleton, match in zip(axes, chosen, matches, strict=True):
         base = skeleton.positions[Joint.SPINE_BASE]
         if match >= 0:
-            _draw_bones(axis, (truths[match].positions - base) @ view.T, color="#9a9a9a", linewidth=4.0, alpha=0.45)
+            truth = truths[match].positions
+            true_base = truth[Joint.SPINE_BASE]
+            true_base = true_base if np.isfinite(true_base).all() else base
+            _draw_bones(axis, (truth - true_base) @ true_view.T, color="#9a9a9a", linewidth=4.0, alpha=0.45)
         points = (skeleton.positions - base) @ view.T
         _draw_bones(axis, points)
         unseen = points[skeleton.states != TrackingState.TRACKED]
@@ -182,7 +193,9 @@ def _draw_person(figure: Any, tracked: Tracked, start_ns: int) -> None:
         axis.set_title(f"{(skeleton.stamp_ns - start_ns) / NANOSECONDS:.1f} s", fontsize=9)
         axis.set_aspect("equal")
         axis.axis("off")
-    figure.supxlabel("left blue, right orange, truth grey; circles: not tracked by any sensor", fontsize=8)
+    figure.supxlabel(
+        "left blue, right orange, truth grey, moved and turned onto it; circles: not tracked by any sensor", fontsize=8
+    )
 
 
 def _draw_bones(axis: Any, points: FloatArray, **style: Any) -> None:
@@ -191,12 +204,29 @@ def _draw_bones(axis: Any, points: FloatArray, **style: Any) -> None:
         axis.plot(*points[list(bone)].T, **{"color": colour, "linewidth": 1.6} | style)
 
 
-def _view(skeletons: list[Skeleton]) -> FloatArray:
-    """(2, 3) world to picture: turned from the person's mean front by the angle of the view, z up."""
+def _left(skeletons: Iterable[Skeleton]) -> npt.NDArray[np.complex128]:
+    """(n,) x + iy of the vectors from the right hip to the left one, metres; 0 where unknown."""
     across = np.array([each.positions[Joint.HIP_LEFT] - each.positions[Joint.HIP_RIGHT] for each in skeletons])
-    left = np.nan_to_num(across).sum(axis=0)
-    heading = np.arctan2(left[1], left[0]) + _VIEW  # the person's left is the picture's right
-    return np.array([[np.cos(heading), np.sin(heading), 0.0], [0.0, 0.0, 1.0]])
+    across = np.nan_to_num(across.reshape(-1, 3))
+    left: npt.NDArray[np.complex128] = across[:, 0] + 1j * across[:, 1]
+    return left
+
+
+def _heading(skeletons: list[Skeleton]) -> float:
+    """Radians from the world's x axis to the mean direction of the person's left."""
+    return float(np.angle(_left(skeletons).sum()))
+
+
+def _turn(pairs: list[tuple[Skeleton, Skeleton]]) -> float:
+    """Radians about z by which the second skeletons are turned against the first; 0 without common hips."""
+    first, second = _left(first for first, _ in pairs), _left(second for _, second in pairs)
+    return float(np.angle((second * first.conj()).sum()))
+
+
+def _view(heading: float) -> FloatArray:
+    """(2, 3) world to picture: turned from the person's front by the angle of the view, z up."""
+    angle = heading + _VIEW  # the person's left is the picture's right
+    return np.array([[np.cos(angle), np.sin(angle), 0.0], [0.0, 0.0, 1.0]])
 
 
 # --- errors

@@ -42,7 +42,10 @@ def summary(angles: AngleSeries, truth: AngleSeries | None = None) -> Table:
         ]
     if are_fine(angles):
         columns = [each._replace(digits=3) if each.unit == "deg" else each for each in columns]
-    return Table("angles", "angle", angles.names, tuple(columns))
+    note = "stddev: median. known: share of the frames with a finite angle, however large its stddev."
+    if np.isfinite(error).any():
+        note += "\ntrue min to max err: of frames with a truth. in 2 sd: errors within two stddev; 95 % is ideal."
+    return Table("angles", "angle", angles.names, tuple(columns), note)
 
 
 def _range(whose: str, values: FloatArray) -> tuple[Column, Column]:
@@ -83,7 +86,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
-    print(summarise(args.bag, args.output, args.body, args.truth).text())
+    table = summarise(args.bag, args.output, args.body, args.truth)
+    print(f"{table.text()}\n{table.note}")
     if args.output is not None:
         print(f"\npicture: {args.output}")
     return 0

@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
+from matplotlib.figure import Figure
+from numpy.testing import assert_allclose, assert_array_equal
 
 from body_tracking.cli import main
 from body_tracking.core.message_types import JOINT_STATE, POINT_CLOUD
-from body_tracking.core.skeleton import N_JOINTS, Skeleton, TrackingState
-from body_tracking.evaluation.reading import AngleSeries, EvaluationError, nearest, read
+from body_tracking.core.skeleton import N_JOINTS, FloatArray, Skeleton, TrackingState
+from body_tracking.evaluation import pictures
+from body_tracking.evaluation.reading import AngleSeries, EvaluationError, Tracked, nearest, read
 from body_tracking.evaluation.show import summarise, summary
 from body_tracking.filters import make_filter
 from body_tracking.kinect.simulated import KinectErrors
@@ -87,6 +89,26 @@ def test_errors_pass_over_the_cut_at_180_degrees() -> None:
     row = summary(series([179.0, -179.0], [1.0, 0.5]), series([-179.0, 179.0], [0.0, 0.0])).row("knee")
     assert row["rms_error"] == pytest.approx(2.0)
     assert row["within_2_stddev"] == 50.0
+
+
+def test_the_note_explains_the_columns_that_are_there() -> None:
+    angles = series([10.0, 20.0], [1.0, 40.0])
+    assert "known:" in summary(angles).note and "in 2 sd:" not in summary(angles).note
+    assert "in 2 sd:" in summary(angles, series([11.0, 20.0], [0.0, 0.0])).note
+
+
+def test_a_truth_in_another_world_is_drawn_onto_the_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(1)
+    states = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
+    positions = rng.normal(size=(N_JOINTS, 3))
+    turned = positions @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]) + [0.5, 0.0, -1.0]
+    here, there = (Skeleton(1, "world", each, states) for each in (positions, turned))
+    drawn: list[FloatArray] = []
+    monkeypatch.setattr(pictures, "_draw_bones", lambda axis, points, **style: drawn.append(points))
+    angles = series([10.0, 20.0], [1.0, 1.0])
+    pictures._draw_person(Figure(), Tracked(Path(), "body1", angles, (here,), None, (there,)), 0)
+    true, estimated = drawn
+    assert_allclose(true, estimated, atol=1e-12)
 
 
 def test_an_angle_never_known_is_dashes_and_infinity() -> None:
