@@ -360,6 +360,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
+    if args.output.is_dir() and not args.overwrite:
+        raise ReplayError(f"{args.output}: exists already; --overwrite replaces it")
     report = replay(args.bag, args.output, settings_from(args), overwrite=args.overwrite)
     if args.json:
         print(json.dumps({"bag": str(args.bag), "output": str(args.output), **asdict(report)}, indent=2))
@@ -375,6 +377,6 @@ def run(args: argparse.Namespace) -> int:
     if args.verbose:
         print(f"left out or noted on the way: {_listed(report.counters)}")
     elif report.counters:
-        print(f"{len(report.counters)} counters of what was left out or noted on the way: -v prints them")
+        print(f"-v prints {len(report.counters)} counters, such as frames, gated joints and accepted T-poses")
     print(f"written to {args.output}")
     return 0

@@ -76,8 +76,9 @@ def _angles(bag: BagReader, body: str) -> Iterator[str]:
             else:
                 medians.append(float(np.median(known)))
                 shares.append(100.0 * len(known) / len(stddevs))
-        text = f"{body}, {limb}: {len(medians)} of {len(names_of_limb)} angles known"
+        text = f"{body}, {limb}: {len(medians)} of {len(names_of_limb)} angles with a standard deviation below "
+        text += f"{UNKNOWN:.0f} deg"
         if medians:
             size = " to ".join(dict.fromkeys((f"{min(medians):.1f}", f"{max(medians):.1f}")))
-            text += f", in {np.mean(shares):.0f} % of the frames, with a standard deviation of {size} deg"
+            text += f", in {np.mean(shares):.0f} % of the frames; median {size} deg"
         yield text + (f"; not {', '.join(unknown)}" if unknown else "")
