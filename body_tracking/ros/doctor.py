@@ -32,8 +32,8 @@ NEEDED = ("filterpy", "vqf", "mcap", "lz4", "zstandard", "rosbags")
 OPTIONAL = {
     "viser": ("no live page", "pip install 'body_tracking[viewer]'"),
     "ezc3d": ("no import of C3D files", "pip install 'body_tracking[c3d]'"),
-    "tf2_msgs": ("no /tf, so no frames in RViz", "sudo apt install ros-jazzy-tf2-msgs"),
-    "hri_msgs": ("no /humans/bodies/tracked (REP-155)", "sudo apt install ros-jazzy-hri-msgs"),
+    "tf2_msgs": ("no /tf, so no frames in RViz", "where ROS is installed: sudo apt install ros-jazzy-tf2-msgs"),
+    "hri_msgs": ("no /humans/bodies/tracked (REP-155)", "where ROS is installed: sudo apt install ros-jazzy-hri-msgs"),
 }
 _RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 _FAST_DDS = ("FASTDDS_BUILTIN_TRANSPORTS", "FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
