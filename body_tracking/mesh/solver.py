@@ -62,8 +62,9 @@ class Settings:
             elsewhere into the trunk, where it stays.
         limit: radians beyond a soft limit.
         damping: share of the information's diagonal that is added at first.
-        matched: least share of points that belong to the body in a fit that is not lost.
-        violations: greatest share of the seen vertices that lie outside of the silhouette in a fit that is not lost.
+        unexplained: greatest sum, in a fit that is not lost, of the share of points that do not belong to the body and
+            that of seen vertices outside of the silhouette. A body that is too large for the person has many of the
+            latter and explains all points; bounds for each share lost such people, and kept more false fits.
     """
 
     surface: float = 0.012
@@ -72,8 +73,7 @@ class Settings:
     front: float = 0.08
     limit: float = 0.05
     damping: float = 1e-3
-    matched: float = 0.75
-    violations: float = 0.15
+    unexplained: float = 0.2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -312,7 +312,8 @@ class MeshFitter:
             if course is not None:
                 start.rotations[0] = facing(course)
             fits.append(self.fit(observation, start, orientations=orientations, scales=WIDE))
-        return min(fits, key=lambda fit: (fit.lost, fit.energy))
+        best = min(fits, key=lambda fit: (fit.lost, fit.energy))
+        return self.fit(observation, best.pose, orientations=orientations) if best.lost else best
 
     def fit(
         self,
@@ -429,7 +430,7 @@ class MeshFitter:
         fit = Fit(
             *(pose, posed, frames, 0.5 * total, information, matches, weights, matched, violations),
             rms=float(np.sqrt((planes[near] ** 2).mean())) if near.any() else float("inf"),
-            lost=matched < settings.matched or violations > settings.violations,
+            lost=1.0 - matched + violations > settings.unexplained,
         )
         return Evaluation(fit, system.gradient)
 

@@ -1,9 +1,9 @@
 """Tracking of one person through depth images: find the pixels, fit the body, notice when it is lost.
 
 Each image is fitted from where the last motion leads. A fit that is lost is tried again with a wide robust scale, from
-the last pose and from another sensor's skeleton where there is one; a person who stays lost is searched for anew, in
-the next candidate of a person's size each time. A person who walks is expected to face that way: such starts are tried
-where the fit leaves points of the person unexplained.
+the last pose and from another sensor's skeleton where there is one, and then by a search; a person who stays lost is
+searched for anew, in the next candidate of a person's size each time. A person who walks is expected to face that way:
+such starts are tried where the fit leaves points of the person unexplained.
 """
 
 from __future__ import annotations
@@ -236,7 +236,7 @@ class MeshTracker:
             self.counters["second starts"] += 1
             fits = [fit, self._fitter.fit(seen, self._fits[-1][1].pose, None, orientations, points, WIDE)]
             course = self._course()
-            if course is not None and self._may_search(stamp_ns):
+            if (course is not None or all(each.lost for each in fits)) and self._may_search(stamp_ns):
                 fits.append(self._fitter.search(seen, orientations, course))
             return min(fits, key=lambda each: (each.lost, each.energy))
         if not self._may_search(stamp_ns):
