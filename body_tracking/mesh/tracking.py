@@ -48,6 +48,9 @@ _COURSE_S: Final = 0.5
 _SLOWEST: Final = 0.35
 _FASTEST: Final = 3.0
 """m/s, horizontally, of a person who walks; what is faster is another person."""
+_SMALLER: Final = (-1.6, -3.2)
+"""Standard deviations of the first shape component, the size: bodies of 1.54 and 1.38 m. The mean one, of 1.70 m, fits
+people of 1.60 to 2 m."""
 _WHOLE: Final = 0.99
 """Share of points that belong to the body below which an arm may be elsewhere than fitted."""
 _EXPLAINED: Final = 0.97
@@ -126,14 +129,25 @@ class MeshTracker:
         self.reset()
 
     def wear(self, body: Body, shape_covariance: FloatArray) -> None:
-        """Track with another body from now on, as after a personalisation."""
-        self._fitter, self._shape_covariance = MeshFitter(body), shape_covariance
-        self._landmarks = kinect_landmarks(body)
+        """Track with another body from now on, as after a personalisation.
+
+        The mean one is nobody's: whom it does not fit is searched for with smaller ones, too.
+        """
+        self._shape_covariance = shape_covariance
+        self._fitters = [MeshFitter(body)]
+        if not body.shape.any():
+            size = np.eye(len(body.shape))[0]
+            self._fitters += [MeshFitter(body.model.body(share * size)) for share in _SMALLER]
+        self._take(self._fitters[0])
         names = [name.rpartition("_")[2] for name in body.model.joint_names]
         self._rates = np.array([[_RATES.get(name, _TRUNK_RATE)] * 3 for name in names])
 
+    def _take(self, fitter: MeshFitter) -> None:
+        self._fitter, self._landmarks, self._smaller = fitter, kinect_landmarks(fitter.body), 0
+
     def reset(self) -> None:
         """Forget the person and the background."""
+        self._take(self._fitters[0])
         self._finder.reset()
         self._fits: list[tuple[int, Fit]] = []
         self._lost_ns: int | None = None
@@ -242,9 +256,22 @@ class MeshTracker:
         if not self._may_search(stamp_ns):
             self.problem = "searching"
             return None
-        fit = self._fitter.search(seen, orientations, self._course())
+        fit = self._searched(seen, orientations)
         if points is not None and fit.lost:
             fit = self._fitter.fit(seen, fit.pose, None, orientations, points, WIDE)
+        return fit
+
+    def _searched(self, seen: Observation, orientations: Sequence[Orientation]) -> Fit:
+        """The best fit of somebody who was not tracked before; a smaller body is kept for them if only that fits."""
+        course = self._course()
+        fit = self._fitter.search(seen, orientations, course)
+        if fit.lost and len(self._fitters) > 1:
+            smaller = self._fitters[1 + self._smaller]
+            self._smaller = (self._smaller + 1) % len(_SMALLER)
+            found = smaller.search(seen, orientations, course)
+            if not found.lost:
+                self._take(smaller)
+                return found
         return fit
 
     def _may_search(self, stamp_ns: int) -> bool:
@@ -329,6 +356,7 @@ class MeshTracker:
         self._lost_ns = stamp_ns if self._lost_ns is None else self._lost_ns
         if self._fits and stamp_ns - self._lost_ns > self.parameters.predict_for * NANOSECONDS:
             self._fits = []
+            self._take(self._fitters[0])
             self.counters["people lost"] += 1
 
     def state(self) -> dict[str, Any]:

@@ -129,6 +129,22 @@ def test_a_person_who_walks_across_is_found_from_the_side_at_once_and_the_right_
     assert np.mean(right) > 0.95
 
 
+@pytest.mark.parametrize("size", [-3.0, -1.5, 0.0, 2.0])
+def test_people_of_1_4_to_1_9_m_are_found_by_the_mean_body_or_a_smaller_one(tracker: MeshTracker, size: float) -> None:
+    model, wall = tracker.body.model, np.full_like(NOTHING, 4.0)
+    body = model.body(size * np.eye(len(tracker.body.shape))[0])
+    tracker.update(0, wall)
+    for number in range(1, 20):
+        pose = MeshFitter(body).neutral(np.array([0.0, 0.0, 2.3]), 0.3 + 0.04 * number, 0.3)
+        person = render(body.posed(pose).vertices, model.faces, recording().camera).depth
+        found = tracker.update(round(number / 15 * NANOSECONDS), np.where(person > 0.0, person, wall))
+        assert found is not None or number < 8
+    assert found is not None
+    names = [f"{side}_{joint}" for side in ("left", "right") for joint in ("shoulder", "elbow", "wrist")]
+    true = body.posed(pose).placed[[model.index(name) for name in names]]
+    assert np.linalg.norm(found.points[ARMS] - true, axis=1).mean() < 0.08
+
+
 def test_the_person_of_the_body_index_is_tracked(tracker: MeshTracker) -> None:
     image = recording().images[STAMPS[0]]
     index = np.full(image.shape, 255, np.uint8)
