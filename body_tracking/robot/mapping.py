@@ -95,7 +95,7 @@ class SafetyLimits:
         0.06, "hold where a sensor's orientation in world is less certain than this", "rad", 0.0001, 3.2
     )
     max_translation_stddev: float = number_field(
-        0.05, "hold where a sensor's place in world is less certain than this", "m", 0.0001, 10.0
+        0.05, "hold where a sensor's place in world, at the person's, is less certain than this", "m", 0.0001, 10.0
     )
     max_calibration_age: float = number_field(
         float("inf"),
