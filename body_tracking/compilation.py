@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
     with ProcessPoolExecutor(mp_context=multiprocessing.get_context("fork")) as pool:
         names = {pool.submit(_seconds, function): name for name, function in functions.items()}
         for done in as_completed(names):
-            print(f"{names[done]}: {done.result():.1f} s", flush=True)
+            print(f"compiled: {names[done]}, {done.result():.1f} s", flush=True)
     return 0
 
 

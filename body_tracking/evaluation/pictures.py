@@ -193,9 +193,10 @@ def _draw_person(figure: Any, tracked: Tracked, start_ns: int) -> None:
         axis.set_title(f"{(skeleton.stamp_ns - start_ns) / NANOSECONDS:.1f} s", fontsize=9)
         axis.set_aspect("equal")
         axis.axis("off")
-    figure.supxlabel(
-        "left blue, right orange, truth grey, moved and turned onto it; circles: not tracked by any sensor", fontsize=8
+    legend = (
+        "left blue, right orange, truth grey (moved and turned onto the estimate); circles: not tracked by any sensor"
     )
+    figure.supxlabel(legend, fontsize=8)
 
 
 def _draw_bones(axis: Any, points: FloatArray, **style: Any) -> None:
