@@ -33,6 +33,13 @@ _FRESH = 3.0
 """Seconds for which a node's diagnostics are valid."""
 
 
+def calibration_part(status: NodeStatus | None, sensors: Collection[str]) -> list[str]:
+    """The calibration's part of the status line; none in a graph of markers alone, which has nothing to calibrate."""
+    if status is None and not sensors:
+        return []
+    return [f"calibration: {status.text if status is not None else 'none'}"]
+
+
 class GraphMonitor:
     """Subscribes in its own thread.
 
@@ -141,8 +148,7 @@ class GraphMonitor:
         delay = self._delay(options, fresh)
         if delay:
             parts.append(delay)
-        calibration = fresh.get("calibration")
-        parts.append(f"calibration: {calibration.text if calibration is not None else 'none'}")
+        parts += calibration_part(fresh.get("calibration"), sensors_of(options))
         malformed = sum(int(status.values.get("malformed", 0)) for status in fresh.values())
         if malformed:
             parts.append(f"malformed {malformed}")
