@@ -127,14 +127,16 @@ class StartPage:
                 part.remove()
             self._parts = []
             for each in self._listed:
-                said = f"{html.escape(each.where)}: {html.escape(each.content)}"
+                name = html.escape(each.path.name)
+                said = f"<b>{name}</b> {html.escape(each.where)}: {html.escape(each.content)}"
+                self._parts.append(gui.add_divider())
                 if each.refusal:
-                    name = f"<b>{html.escape(each.path.name)}</b> {said}"
-                    self._parts.append(gui.add_html(block([line(GREY, "", f"{name}. {html.escape(each.refusal)}")])))
+                    self._parts.append(gui.add_html(block([line(GREY, "", f"{said}. {html.escape(each.refusal)}")])))
                     continue
+                self._parts.append(gui.add_html(block([said])))
                 button: Any = gui.add_button(f"play {each.path.name}")
                 button.on_click(lambda _, path=each.path: self._choose(self._choice(path)))
-                self._parts += [button, gui.add_html(block([said]))]
+                self._parts.append(button)
             if not self._listed:
                 self._parts.append(gui.add_html(block([line(ORANGE, "none", "no recordings here")])))
 

@@ -62,7 +62,7 @@ def choose(browser: Browser, label: str, option: str) -> None:
 def test_from_the_start_page_to_a_recording_and_back(start_page: Browser) -> None:
     browser, page = start_page, start_page.page
     browser.reads("no sensor publishes in ROS domain")
-    browser.reads(r"play mine\n+in this folder: 15\.4 s, sensors kinect1, kinect2")
+    browser.reads(r"mine\s+in this folder: 15\.4 s, sensors kinect1, kinect2\s+play mine")
     browser.reads("broken in this folder: cannot be read")
     browser.reads("play camera_reaching")
     browser.reads("play markers_arm")
