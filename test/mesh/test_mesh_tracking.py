@@ -116,7 +116,7 @@ def test_a_person_who_walks_across_is_found_from_the_side_at_once_and_the_right_
         tracker = MeshTracker(DepthCamera(recording().camera), body, np.eye(len(body.shape)))
         fitter = MeshFitter(body)
         tracker.update(0, wall)
-        for number in range(1, 31):
+        for number in range(1, 13):
             pose = fitter.neutral(np.array([side * (1.5 - 0.9 * number / 15), 0.0, 2.2]), elevation, flexion)
             pose.rotations[0] = facing(np.array([-side, 0.0, 0.0]))
             person = render(body.posed(pose).vertices, body.model.faces, recording().camera).depth
