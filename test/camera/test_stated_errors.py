@@ -90,4 +90,4 @@ def test_elbows_and_elevations_are_within_what_is_stated_if_the_joints_err_by_th
     runs = [(person, filtered(person, seed)) for seed, person in enumerate(people)]
     shares = np.mean([covered(*run, 0.0, angles) for run in runs], axis=0)
     assert (shares > 0.88).all(), dict(zip(names, shares, strict=True))
-    assert np.mean([covered(*run, BONE_CORRELATION, angles[:2]) for run in runs]) < 0.8
+    assert np.mean([covered(*run, BONE_CORRELATION, angles[:2]) for run in runs]) < 0.7
