@@ -1,4 +1,4 @@
-"""``body_tracking evaluate``: errors against the truth as tables, JSON and a page with pictures."""
+"""``body_tracking evaluate``: errors against the truth in a few lines, as tables, JSON and a page with pictures."""
 
 from __future__ import annotations
 
@@ -96,7 +96,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--save-mountings", type=Path, metavar="FILE", help="likewise: write the mountings of the targets that fit EST"
     )
     parser.add_argument("--html", type=Path, metavar="FILE", help="write a page with tables and pictures")
-    parser.add_argument("--json", action="store_true", help="print all results as JSON instead of tables")
+    parser.add_argument("--json", action="store_true", help="print all results as JSON")
+    parser.add_argument("-v", "--verbose", action="store_true", help="also print tables with all joints and angles")
     parser.set_defaults(run=run)
 
 
@@ -156,11 +157,14 @@ def run(args: argparse.Namespace) -> int:
     if args.html is not None:
         make_folder(args.html)
         write(args.html, report.page(draw()).encode())
-    print(report.json() if args.json else f"{report.lines()}\n{report.text()}")
-    if not args.json:
+    if args.json:
+        print(report.json())
+    else:
+        print(report.lines())
+        print(report.text() if args.verbose else "-v prints tables with all joints and angles")
         for name, path in (("report", args.html), ("mountings", args.save_mountings)):
             if path is not None:
-                print(f"\n{name}: {path}")
+                print(f"{name}: {path}")
     return 0
 
 

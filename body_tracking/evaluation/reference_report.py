@@ -6,6 +6,7 @@ import numpy as np
 
 from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.evaluation.mutual_comparison import MutualComparison
+from body_tracking.evaluation.overview import coverage_in_words, errors_in_words
 from body_tracking.evaluation.reference_comparison import ReferenceEvaluation
 from body_tracking.evaluation.reference_error import Judged
 from body_tracking.evaluation.report import Column, Report, Table, numbered
@@ -70,6 +71,20 @@ def tables(result: ReferenceEvaluation) -> tuple[Table, ...]:
     return tuple(made)
 
 
+def _in_words(name: str, rows: tuple[Judged, ...]) -> list[tuple[str, str]]:
+    """The errors of the rows, without what the reference takes in them, and how true the stated deviations are."""
+    known = [row for row in rows if not row.too_poor]
+    lines = [
+        f"{len(known)} of {len(rows)} for which the reference is good enough",
+        errors_in_words([row.name for row in known], np.degrees([row.error for row in known]), "deg"),
+    ]
+    covered = np.array([row.covered for row in rows])
+    if np.isfinite(covered).any():
+        samples = np.array([row.samples for row in rows], dtype=np.float64)
+        lines.append(coverage_in_words("differences within 1.96 standard deviations of both", covered, samples))
+    return [("" if number else name, line) for number, line in enumerate(lines)]
+
+
 def mutual_report_of(result: MutualComparison) -> Report:
     """The report of an evaluation by another estimate."""
     estimate, reference = result.estimate, result.reference
@@ -80,7 +95,8 @@ def mutual_report_of(result: MutualComparison) -> Report:
         ("reference", f"{reference.source} {reference.topic}: {len(reference.stamps_ns)} frames, another estimate"),
         ("compared", f"{result.seconds:.2f} s"),
         ("clock", f"the reference's minus the estimate's {clock}"),
-        ("all", f"RMS difference {np.degrees(result.measured):.1f} deg, {100.0 * result.covered:.0f} % of them in 95%"),
+        *_in_words("angles", result.angles),
+        ("", f"RMS difference of all {np.degrees(result.measured):.1f} deg"),
         *(("note", note) for note in (*result.notes, *_notes(result))),
     )
     content = {
@@ -129,6 +145,8 @@ def report_of(result: ReferenceEvaluation) -> Report:
         ),
         ("world", f"rig to world known to {np.degrees(fit.world_stddev):.2f} deg per axis"),
         ("motion", f"of the targets {first:.0f} deg RMS about one axis, {second:.0f} about a second"),
+        *(_in_words("angles", result.angles) if result.angles else ()),
+        *_in_words("segments", result.orientations),
     ]
     content = {
         "estimate": str(result.estimate.source),

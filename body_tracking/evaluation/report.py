@@ -12,8 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from body_tracking.core.skeleton import BONES, JOINT_NAMES, NANOSECONDS, FloatArray, IntArray, Joint
-from body_tracking.evaluation.comparison import BEYOND, AngleComparison, Comparison, Evaluation
+from body_tracking.evaluation.comparison import AS_IT_IS, BEYOND, AngleComparison, Comparison, Evaluation
+from body_tracking.evaluation.overview import coverage_in_words, errors_in_words
 from body_tracking.evaluation.reading import EvaluationError
+from body_tracking.kinematics.labels import UNKNOWN
 
 THESIS_JOINTS = (
     *(Joint.SPINE_MID, Joint.SPINE_SHOULDER),
@@ -160,8 +162,11 @@ def report_of(result: Evaluation) -> Report:
 def tables(result: Evaluation) -> tuple[Table, ...]:
     """All results as tables."""
     made = [_joint_table(result, comparison) for comparison in result.comparisons]
+    title = "angles of both skeletons"
+    if named_are_positional(result):
+        title += ", which are those by name"
     for each in result.comparisons:
-        made.append(_angle_table(each.positional, each.name, "angles", "angles of both skeletons"))
+        made.append(_angle_table(each.positional, each.name, "angles", title))
         if each.named is not None:
             made.append(_angle_table(each.named, each.name, "named", "angles by name, as the estimate states them"))
     return (*made, _length_table(result), *([_calibration_table(result)] if result.calibration else []))
@@ -256,14 +261,71 @@ def _facts(result: Evaluation) -> tuple[tuple[str, str], ...]:
         ("truth", f"{truth.source} {truth.topic}".rstrip() + f": {len(truth.stamps_ns)} frames"),
         ("compared", f"{last - first:.2f} s, from {first:.2f} s on, of the truth's {length:.2f} s"),
         ("delay", "cannot be told" if np.isnan(result.delay) else delay),
+        *(("" if number else "angles", text) for number, text in enumerate(_angles_in_words(result))),
+        *(("" if number else "joints", text) for number, text in enumerate(_joints_in_words(result))),
     ]
-    for comparison in result.comparisons:
-        pooled = {column.key: column.text(-1) for column in _joint_table(result, comparison).columns}
-        offset = f"{pooled['fixed_rms']} mm without each joint's own offset"
-        rows.append((comparison.name, f"RMS 3D {pooled['rms']} mm; {offset}"))
-    if named_are_positional(result):
-        rows.append(("angles", "those that the estimate states by name are those of its skeletons"))
-    return (*rows, *(("note", note) for note in result.notes))
+    notes = list(result.notes)
+    if _other_frame(result) and estimate.frame_id == truth.frame_id:
+        off = 1e3 * np.nanmedian(result.comparisons[0].joints.rms)
+        notes.append(
+            f"as they are, joints are {off:.0f} mm off in the median: the truth has another origin or other axes, or "
+            "the calibration is wrong"
+        )
+    return (*rows, *(("note", note) for note in notes))
+
+
+def _other_frame(result: Evaluation) -> bool:
+    """Whether alignment brings joints close that are far away as they are."""
+    first, last = (each.joints.rms[each.joints.frames > 0] for each in (result.comparisons[0], result.comparisons[-1]))
+    return bool(np.median(first) > BEYOND > np.median(last))
+
+
+def _headline(result: Evaluation) -> Comparison:
+    """The comparison to begin with: as it is, but aligned where estimate and truth have other frames."""
+    return result.comparisons[-1 if _other_frame(result) else 0]
+
+
+def _angles_in_words(result: Evaluation) -> list[str]:
+    """The angles that the estimate states by name, else those of its skeletons."""
+    comparison = _headline(result)
+    compared = comparison.named or comparison.positional
+    errors = compared.errors
+    known, count = errors.frames > 0, f"{len(compared.names)}"
+    stated = np.where(np.isfinite(compared.stddev), compared.stddev, np.inf)
+    if np.isfinite(stated).any():
+        # as in what replay prints
+        known &= np.median(stated, axis=0) < np.radians(UNKNOWN)
+        count = f"{known.sum()} of {count} known (standard deviation below {UNKNOWN:.0f} deg in most frames)"
+    names = [name for name, there in zip(compared.names, known, strict=True) if there]
+    lines = [count + ("" if comparison.named else ", computed from both skeletons")]
+    if names:
+        lines += [
+            errors_in_words(names, np.degrees(errors.rmse[known]), "deg"),
+            coverage_in_words("truth within 1.96 standard deviations", errors.covered[known], errors.frames[known]),
+        ]
+    if not known.all():
+        lines.append(f"not known: {', '.join(name for name in compared.names if name not in names)}")
+    return lines
+
+
+def _joints_in_words(result: Evaluation) -> list[str]:
+    def median(rms: FloatArray) -> str:
+        return f"{1e3 * np.median(rms[np.isfinite(rms)]):.1f} mm"
+
+    shown, aligned = _headline(result), result.comparisons[-1]
+    errors, there = shown.joints, shown.joints.frames > 0
+    names = [name for name, known in zip(JOINT_NAMES, there, strict=True) if known]
+    count, more = f"{len(names)}", f"median {median(errors.fixed_rms)} without each joint's own offset"
+    if shown.name != AS_IT_IS:
+        count += ", after alignment in time and space"
+    elif aligned is not shown:
+        more += f", {median(aligned.joints.rms)} after alignment in time and space"
+    return [
+        count,
+        errors_in_words(names, 1e3 * errors.rms[there], "mm"),
+        coverage_in_words("truth within the stated 95 % ellipsoid", errors.covered[there], errors.frames[there]),
+        more,
+    ]
 
 
 def numbered(value: float) -> float | None:

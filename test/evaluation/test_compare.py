@@ -123,6 +123,10 @@ def test_another_estimate_is_a_reference_that_errs_itself(
     true = np.sqrt((elbow_errors(other) ** 2).mean())
     assert row["low"] < true < row["high"] and true < row["difference"]
     assert ELBOW not in content["too_poor"]
+    assert main(["evaluate", str(folder / "other"), "--truth", str(folder / "one")]) == 0
+    shown, rows = capsys.readouterr().out, content["tables"]["reference_angles"]["rows"]
+    assert f"angles    {len(rows) - len(content['too_poor'])} of {len(rows)} for which the reference is good" in shown
+    assert f"worst {ELBOW} {row['error']:.1f} deg" in shown and "-v prints" in shown and "RMSE-o" not in shown
 
 
 @pytest.mark.parametrize(

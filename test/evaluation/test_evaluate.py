@@ -44,7 +44,7 @@ def bag_of(folder: Path, skeletons: int, topic: str = "/filtered/skeleton", kind
 def test_the_table_holds_the_results(
     replayed_wave: Path, wave: Path, result: Evaluation, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["evaluate", str(replayed_wave), "--truth", str(wave)]) == 0
+    assert main(["evaluate", str(replayed_wave), "--truth", str(wave), "-v"]) == 0
     shown = capsys.readouterr().out
     wrist = JOINT_NAMES.index("WristLeft")
     line = next(line for line in shown.splitlines() if line.startswith("WristLeft "))
@@ -55,6 +55,38 @@ def test_the_table_holds_the_results(
     assert 5.0 < float(ten.split()[5]) < 100.0
     assert "kinect2" in shown and "elbow_flexion_left" in shown and "ElbowLeft-WristLeft" in shown
     assert f"delay     {1e3 * result.delay:.1f} ms" in shown
+
+
+def test_a_dozen_lines_say_how_good_the_estimate_is(
+    replayed_wave: Path, wave: Path, result: Evaluation, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["evaluate", str(replayed_wave), "--truth", str(wave)]) == 0
+    shown = capsys.readouterr().out
+    assert len(shown.splitlines()) <= 16 and "-v prints" in shown
+    named = result.comparisons[0].named
+    assert named is not None
+    known = np.median(named.stddev, axis=0) < np.radians(30.0)
+    errors = np.degrees(named.errors.rmse[known])
+    assert f"angles    {known.sum()} of {len(known)} known " in shown
+    best, worst = (np.array(named.names)[known][pick] for pick in (errors.argmin(), errors.argmax()))
+    assert (
+        f"median RMS error {np.median(errors):.1f} deg, best {best} {errors.min():.1f} deg, "
+        f"worst {worst} {errors.max():.1f} deg" in shown
+    )
+    inside = np.abs(named.found - named.true)[:, known] <= 1.96 * named.stddev[:, known]
+    (stated,) = re.findall(r"truth within 1\.96 standard deviations in (\d+) % of the frames", shown)
+    assert float(stated) == pytest.approx(100.0 * inside.mean(), abs=1.0)
+    rms = 1e3 * result.comparisons[0].joints.rms
+    assert f"median RMS error {np.nanmedian(rms):.1f} mm, " in shown
+
+
+def test_the_lines_are_of_the_aligned_estimate_where_its_frame_is_another(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", str(BAGS / "tpose_wave"), "--topic", "/kinect1/skeleton"]) == 0
+    shown = capsys.readouterr().out
+    assert "joints    25, after alignment in time and space\n" in shown and "no standard deviations are stated" in shown
+    assert "'as it is' compares 'kinect1_optical_frame' with 'world'" in shown
+    (error,) = re.findall(r"median RMS error ([\d.]+) mm", shown)
+    assert float(error) < 150.0
 
 
 def test_json_and_tables_agree(replayed_wave: Path, result: Evaluation, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,42 @@
+"""An evaluation in a few lines: the middle, the best and the worst error, and how true the stated deviations are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from body_tracking.core.skeleton import FloatArray, IntArray
+
+
+def errors_in_words(names: Sequence[str], errors: FloatArray, unit: str) -> str:
+    """The middle of the errors, and which are the smallest and the largest.
+
+    Args:
+        names: n names.
+        errors: (n,) in the unit; NaN where there is none.
+        unit: mm or deg.
+    """
+    there = np.isfinite(errors)
+    if not there.any():
+        return "no error can be stated"
+    text = f"median RMS error {np.median(errors[there]):.1f} {unit}"
+    if there.sum() > 1:
+        best, worst = int(np.nanargmin(errors)), int(np.nanargmax(errors))
+        text += f", best {names[best]} {errors[best]:.1f} {unit}, worst {names[worst]} {errors[worst]:.1f} {unit}"
+    return text
+
+
+def coverage_in_words(event: str, covered: FloatArray, frames: FloatArray | IntArray) -> str:
+    """In which share of all frames the truth is where the estimate says.
+
+    Args:
+        event: whose probability is 95 %.
+        covered: (n,) shares; NaN where no deviation is stated.
+        frames: (n,) how many frames each is a share of.
+    """
+    there = np.isfinite(covered)
+    if not there.any():
+        return "no standard deviations are stated"
+    share = float(np.average(covered[there], weights=frames[there]))
+    return f"{event} in {100.0 * share:.0f} % of the frames (ideal: 95 %)"
