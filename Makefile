@@ -39,6 +39,7 @@ help: ## list the targets
 	@sed -n 's/^\([a-z0-9-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 16
 
 setup: $(STAMP) ## create .venv with everything in it
+	@echo "ready: . $(BIN)/activate, then body_tracking says what to do next"
 
 # The first Python that is new enough; `make PYTHON=/path/to/python3` chooses another.
 $(STAMP): setup.py setup.cfg
@@ -53,7 +54,7 @@ $(STAMP): setup.py setup.cfg
 	fi; \
 	[ -x $(BIN)/python ] && $(BIN)/python -m pip --version >/dev/null 2>&1 || "$$python" -m venv --clear $(VENV)
 	@echo "installing into $(VENV) (the first time it takes two or three minutes, and 1.6 GB)"
-	@$(BIN)/python -m pip install -qq --disable-pip-version-check --editable '.[ros,viewer,camera,test,bench]'
+	@$(BIN)/python scripts/pip_install.py $(VENV)/pip.log --editable '.[ros,viewer,camera,test,bench]'
 	@$(BIN)/body_tracking compile
 	@$(BIN)/body_tracking camera model || echo "make: go on without it: cameras find nobody, and their tests are skipped" >&2
 	@touch $@

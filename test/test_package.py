@@ -289,6 +289,33 @@ def test_make_leaves_other_environments_behind(tmp_path: Path) -> None:
         assert 1 <= int(seen["ROS_DOMAIN_ID"]) <= 100
 
 
+def test_make_setup_says_what_pip_does_and_why_it_failed(tmp_path: Path) -> None:
+    """pip prints some hundred lines, or none; a user waits a minute or more."""
+    log, script = tmp_path / "pip.log", ROOT / "scripts" / "pip_install.py"
+    failed = subprocess.run(
+        [sys.executable, script, log, "--no-index", "no-such-package-of-ours"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert failed.returncode == 1
+    assert failed.stdout == f"collecting packages\npip failed; all that it printed is in {log}:\n"
+    assert failed.stderr.startswith("ERROR: ") and failed.stderr in log.read_text()
+    code = f"""import runpy
+names = runpy.run_path({str(script)!r})
+phases = names["Phases"](names["Line"]())
+for text in (
+    "Collecting scipy>=1.11 (from body_tracking==0.2.0)",
+    "  Downloading scipy-1.17.0-cp311-cp311-manylinux_2_28_x86_64.whl (35.0 MB)",
+    "Collecting tqdm",
+    "  Downloading https://host/tqdm-4.70.1-py3-none-any.whl (580 kB)",
+    "Installing collected packages: tqdm, scipy",
+):
+    phases.read(text)
+phases.end()"""
+    assert run(sys.executable, "-c", code, cwd=tmp_path).stdout == "installing 2 packages, 36 MB downloaded\n"
+
+
 def test_ci_runs_make_test() -> None:
     script = ROOT / ".ci" / "run"
     assert os.access(script, os.X_OK)
