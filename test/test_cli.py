@@ -15,7 +15,7 @@ from body_tracking import cli
 from body_tracking.ros import advice
 
 ROOT = Path(__file__).resolve().parent.parent
-COMMANDS = ("import", "bag info", "replay", "calibrate", "up", "doctor", "show", "evaluate", "make-bags")
+COMMANDS = ("import", "bag info", "replay", "calibrate", "up", "doctor", "call", "show", "evaluate", "make-bags")
 
 
 @pytest.mark.parametrize("command", ["", *COMMANDS])
@@ -99,6 +99,20 @@ def test_closed_stdout_is_no_error() -> None:
         process.stdout.close()
         assert process.wait(30.0) in (0, 141)
         assert process.stderr.read() == b""
+
+
+@pytest.mark.parametrize("command", ["call", "doctor"])
+def test_help_loads_neither_numpy_nor_the_client_library(command: str) -> None:
+    code = f"""
+import sys
+from body_tracking import cli
+try:
+    cli.main([{command!r}, "--help"])
+except SystemExit:
+    print(sorted({{"numpy", "rclpy", "scipy"}} & sys.modules.keys()))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
 
 
 NUMERIC_THREADS = """

@@ -98,7 +98,7 @@ class RobotCommands(GraphNode):
         if not self.follower.enabled:
             self.get_logger().warning(
                 f"waits for a person: without a state_topic the position of {self.mapping.robot} is unknown. Once it "
-                f"stands at home: ros2 service call {enable.service_name} std_srvs/srv/Trigger"
+                f"stands at home: body_tracking call {enable.service_name}"
             )
         self.create_timer(1.0 / float(str(self.values["rate"])), self.publish_command, clock=STEADY)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
@@ -51,10 +52,11 @@ def _domain(page: str) -> Iterator[Step]:
     found = look(patience=_PATIENCE)
     if found.runs:
         yield (
-            "A graph runs. Look at it, or find out what is wrong with it:",
+            "A graph runs. Find out what is wrong with it, and which services it has:",
             (
-                "ros2 topic echo /humans/bodies/body1/joint_states",
+                *(("ros2 topic echo /humans/bodies/body1/joint_states",) if shutil.which("ros2") else ()),
                 "body_tracking doctor",
+                "body_tracking call",
             ),
         )
     elif found.sensors:

@@ -36,6 +36,7 @@ SYSTEM = System(
             "body_tracking.ros.doctor",
             "find out why nothing arrives: check the shell, the graph or a bag",
         ),
+        Command("call", "body_tracking.ros.call", "call a service of the running graph, or list its services"),
         Command("compile", "body_tracking.compilation", "compile image processing and the filter ekf in advance"),
     ),
 )
