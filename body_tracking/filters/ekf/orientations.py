@@ -9,7 +9,7 @@ import numpy as np
 
 from body_tracking.core import so3
 from body_tracking.core.orientation import SEGMENT_NUMBER, SegmentOrientation
-from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray
+from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
 from body_tracking.filters.ekf.algebra import CLOSE, FAR, LINEARISATIONS, whitening_of
 from body_tracking.filters.ekf.motion import Motion
 from body_tracking.filters.ekf.parameters import EkfParameters
@@ -53,9 +53,10 @@ class OrientationUpdate:
         parameters: EkfParameters,
         counters: dict[str, int],
     ) -> None:
-        self._space, self._model = space, space.model
+        self._space, self._model, self._ranges = space, space.model, space.ranges
         self._motion, self._priors = motion, priors
         self._parameters, self._counters, self._gate = parameters, counters, parameters.gate
+        self._by_thumbs = self._thumb_table()
 
     def oriented(self, state: State, measurement: SegmentOrientation) -> State:
         """A state corrected by an orientation, at its time; the same state where it comes too soon.
@@ -237,6 +238,9 @@ class OrientationUpdate:
         covariance[old:, old:] = added
         none = np.zeros((PER_SOURCE, state.crosses.shape[1]), dtype=state.crosses.dtype)
         crosses = np.concatenate([state.crosses, none])
+        # the updates by thumbs so far had too much weight
+        doubtful = self._by_thumbs[sources.segments[-1]]
+        covariance[doubtful, doubtful] += self._ranges.stddev[doubtful - 6] ** 2
         # what was unobserved may be so no longer
         null = np.empty((0, self._space.nv))
         return state.but(sources=sources, covariance=covariance, crosses=crosses, null=null)
@@ -284,3 +288,13 @@ class OrientationUpdate:
             covariance=state.covariance[np.ix_(rows, rows)],
             crosses=state.crosses[rows],
         )
+
+    def _thumb_table(self) -> list[IntArray]:
+        """(12,) of each segment the coordinates that rest on its thumb."""
+        coordinates = [np.empty(0, dtype=np.intp) for _ in self._model.segment_names]
+        for number in np.flatnonzero(self._space.thumbs.any(axis=1)).tolist():
+            side = self._model.segment_names[number].rsplit("_", 1)[1]
+            resting = ("forearm_pronation", "wrist_flexion", "wrist_deviation")
+            places = [self._model.coordinate_names.index(f"{each}_{side}") for each in resting]
+            coordinates[number] = np.array(places, dtype=np.intp)
+        return coordinates
