@@ -15,6 +15,10 @@ from body_tracking.viewing.shapes import figure, joint_label
 from body_tracking.viewing.snapshot import Seen
 
 BALL: Final = trimesh.creation.icosphere(subdivisions=2)
+_JOINT_RADIUS: Final = 1e-3
+_JOINT: Final = trimesh.creation.icosphere(subdivisions=2, radius=_JOINT_RADIUS)
+"""Small before it is scaled: until a joint is first pointed at, viser's invisible outline of joints takes clicks at the
+origin, unscaled. A ball of a metre there kept those from the legs of whoever stood behind the reference sensor."""
 TUBE: Final = trimesh.creation.cylinder(radius=1.0, height=1.0, sections=16)
 STALE: Final[Colour] = (190, 190, 190)
 
@@ -25,7 +29,7 @@ class Drawn:
     def __init__(self, scene: viser.SceneApi, name: str, colour: Colour, radius: float, thickness: float) -> None:
         self._scene, self._name, self._colour, self._thickness = scene, name, colour, thickness
         self._radius = radius
-        self._joints = Shapes(scene, f"{name}/joints", BALL, colour, clicked=self._on_click)
+        self._joints = Shapes(scene, f"{name}/joints", _JOINT, colour, clicked=self._on_click)
         self._lines: Any = None
         self._which: IntArray = np.empty((0, 2), np.intp)
         self._named: set[tuple[int, int]] = set()
@@ -47,7 +51,7 @@ class Drawn:
         self._draw_names(drawn.joints, names)
         colours: Any = STALE if seen.stale else drawn.joint_colours
         count = len(drawn.joints)
-        self._joints.draw(drawn.joints, None, np.full((count, 3), self._radius), colour=colours)
+        self._joints.draw(drawn.joints, None, np.full((count, 3), self._radius / _JOINT_RADIUS), colour=colours)
         colour = STALE if seen.stale else self._colour
         if self._lines is None or len(drawn.bones) > len(self._lines.points):
             room = max(24, len(drawn.bones))

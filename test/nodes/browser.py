@@ -30,6 +30,19 @@ JOINTS = """name => {
 }"""
 
 
+ON_SCREEN = """([name, index]) => {
+  const view = window.__viserMutable, box = view.canvas.getBoundingClientRect();
+  const bytes = window.__viserSceneTree.getState()[name].message.props.batched_positions;
+  const at = new Float32Array(bytes.buffer, bytes.byteOffset, bytes.byteLength / 4).slice(3 * index, 3 * index + 3);
+  const point = view.camera.position.clone().set(...at);
+  point.applyMatrix4(view.nodeRefFromName[name].matrixWorld).project(view.camera);
+  return [box.x + (0.5 + 0.5 * point.x) * box.width, box.y + (0.5 - 0.5 * point.y) * box.height];
+}"""
+
+LABELS = (
+    """() => Object.values(window.__viserSceneTree.getState()).map(each => each.message.props.text).filter(Boolean)"""
+)
+
 OUT_OF_REACH = """roles => roles.flatMap(role => Array.from(document.querySelectorAll(role))).filter(each => {
   each.scrollIntoView({block: "center"});
   const box = each.getBoundingClientRect();
@@ -93,6 +106,14 @@ class Browser:
         """(n, 3) points that the page draws there."""
         numbers = self.page.evaluate(JOINTS, name)
         return None if numbers is None else np.array(numbers).reshape(-1, 3)
+
+    def click(self, name: str, index: int) -> None:
+        """Click on one of the points that the page draws there."""
+        self.page.mouse.click(*self.page.evaluate(ON_SCREEN, [name, index]))
+
+    def labels(self) -> list[str]:
+        """The names in the scene."""
+        return list(self.page.evaluate(LABELS))
 
     def press(self, button: str) -> None:
         self.page.get_by_role("button", name=button, exact=True).dispatch_event("click")

@@ -18,8 +18,10 @@ pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 pytest.importorskip("viser", reason="viser is not installed")
 
 from browser import Browser, browsing, need_chromium  # noqa: E402
+from rcl_interfaces.srv import GetParameters  # noqa: E402
 from running import BAG, Running, stop  # noqa: E402
 
+from body_tracking.core.skeleton import Joint  # noqa: E402
 from body_tracking.viewing.page import LAYERS  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.alone]  # the browser draws in software, on all processors
@@ -118,6 +120,28 @@ def test_from_the_start_page_to_a_recording_and_back(start_page: Browser) -> Non
     browser.reads("play body_tracking_")  # what was recorded meanwhile, in the folder of the command
     at_both_sizes(browser)
     assert stop(browser.running.processes.pop("view")) == 0
+
+
+def test_the_filter_of_the_start_page_and_a_click_on_a_joint(start_page: Browser) -> None:
+    browser, page = start_page, start_page.page
+    browser.reads("play mine")
+    choose(browser, "filter", "lkf_zero_velocity")
+    browser.press("play mine")
+    browser.reads(r"playing mine, [4-9][\d.]+ of 15\.4 s")  # the person stands, the arms are up
+    field = page.locator("xpath=//label[.='filter']/following::input[1]")
+    browser.until(lambda: field.input_value() == "lkf_zero_velocity", "the chosen filter")
+    name = GetParameters.Request(names=["filter"])
+    (running_filter,) = browser.running.call(GetParameters, "/skeleton_filter/get_parameters", name).values
+    assert running_filter.string_value == "lkf_zero_velocity"
+
+    browser.press("pause")
+    browser.answer("paused at")
+    browser.close_notes()
+    page.wait_for_timeout(2e3)  # until the last frame is drawn
+    # beyond the origin, which is at the reference sensor, and with no other joint near
+    for shown in (True, False):
+        browser.click("/filtered/joints", Joint.KNEE_LEFT)
+        browser.until(lambda shown=shown: ("left knee" in browser.labels()) == shown, f"the knee's name: {shown}")
 
 
 def test_live_sensors_one_of_which_is_lost(start_page: Browser) -> None:
