@@ -3,12 +3,14 @@
 The clips are exercises of the right arm of five people (UI-PRMD, Vakanski et al. 2018), each recorded by both systems.
 Filters run with and without the law of the arms' directions (``calibration.arm_directions``), which is fitted leaving
 out the subject it is tried on; ``--fit`` prints the law of all subjects, which is the shipped one. The table holds the
-median over subjects of their clips' medians, and of these the ratio to the raw skeleton; coverage is the share of
-frames whose error lies within 1.96 of the published standard deviation (linear filters: positional angles; ``ekf``:
-convention ``isb``), and deviation the median of these. The linear filters' deviations depend on the correlation of
-neighbouring joints' errors (``core.measurement``), which is fitted without that subject, too; ``ekf`` has the shipped
-one. Rate is the RMS of the angle's error differentiated by time, degrees per second; ``--lag`` adds rows with smoothing
-(``filters.smoothing``). Clips whose time warp explains less than 0.9 are left out.
+median over subjects of their clips' medians, and of these the ratio to the raw skeleton; stddev is the median of the
+published standard deviations (linear filters: positional angles; ``ekf``: convention ``isb``), and coverage the share
+of all frames of a subject whose error lies within 1.96 of it, mean over subjects. (Coverage of the median clip, which
+the last column shows, is no measure of it: errors persist throughout a clip, so that the median clip has all of its
+frames inside although those of all clips together have 95 %.) The linear filters' deviations depend on the correlation
+of neighbouring joints' errors (``core.measurement``), which is fitted without that subject, too; ``ekf`` has the
+shipped one. Rate is the RMS of the angle's error differentiated by time, degrees per second; ``--lag`` adds rows with
+smoothing (``filters.smoothing``). Clips whose time warp explains less than 0.9 are left out.
 
 Angles. Elevation: upper arm against the trunk axis, 0 hanging; flexion: forearm against upper arm, 0 straight. Kinect:
 the lines between the joints, trunk axis from SpineMid to SpineShoulder. Vicon: from joint centres that are computed
@@ -438,6 +440,10 @@ def _summary(rows: list[dict[str, Any]], subjects: list[str], name: str, angle: 
     def by_subject(key: str, method: str = name) -> list[float]:
         return [median(row[method][angle][key] for row in rows if row["subject"] == each) for each in subjects]
 
+    def covered(subject: str) -> float:
+        clips = [row[name][angle] for row in rows if row["subject"] == subject]
+        return float(np.average([each["coverage"] for each in clips], weights=[each["samples"] for each in clips]))
+
     own, raw = by_subject("rms"), by_subject("rms", RAW)
     return {
         key: median(by_subject(key))
@@ -445,7 +451,8 @@ def _summary(rows: list[dict[str, Any]], subjects: list[str], name: str, angle: 
     } | {
         "of_raw": median(own) / median(raw),
         "worst": max(one - other for one, other in zip(own, raw, strict=True)),
-        "coverage": float(np.mean(by_subject("coverage"))) if name != RAW else float("nan"),
+        "coverage": float(np.mean([covered(each) for each in subjects])) if name != RAW else float("nan"),
+        "median_clip": float(np.mean(by_subject("coverage"))) if name != RAW else float("nan"),
         "subjects": own,
     }
 
@@ -468,8 +475,9 @@ def show(table: dict[str, dict[str, dict[str, Any]]], used: int, of: int, correl
     print("correlation of a bone's joints without each: " + " ".join(f"{each:.3f}" for each in correlations.values()))
     columns = (
         f"{'RMS':>5} {'of raw':>6} {'debiased':>8} {'bias':>5} {'rate':>5} {'worst':>5} {'stddev':>6} {'coverage':>8}"
+        f" {'(clip)':>6}"
     )
-    print(f"{'':<34}{'elevation':^55}   {'elbow flexion':^55}")
+    print(f"{'':<34}{'elevation':^62}   {'elbow flexion':^62}")
     print(f"{'':<34}{columns}   {columns}")
     for name, angles in table.items():
         print(f"{name:<34}" + "   ".join(_line(angles[angle]) for angle in ANGLES))
@@ -483,7 +491,8 @@ def show(table: dict[str, dict[str, dict[str, Any]]], used: int, of: int, correl
 def _line(own: dict[str, Any]) -> str:
     accuracy = f"{own['rms']:>5.1f} {own['of_raw']:>6.3f} {own['debiased_rms']:>8.2f} {own['bias']:>5.1f}"
     accuracy += f" {own['rate_rms']:>5.1f}"
-    return f"{accuracy} {own['worst']:>5.1f} {own.get('stddev', float('nan')):>6.1f} {own['coverage']:>8.3f}"
+    stated = f"{own.get('stddev', float('nan')):>6.1f} {own['coverage']:>8.3f} {own['median_clip']:>6.2f}"
+    return f"{accuracy} {own['worst']:>5.1f} {stated}"
 
 
 if __name__ == "__main__":
