@@ -44,6 +44,7 @@ from scipy.optimize import brentq
 from time_warp import TimeWarp, compare, estimate_warp
 
 from body_tracking.calibration.arm_directions import ArmLaw, corrected_arms, fit_arm_law
+from body_tracking.calibration.kinect_spine import corrected_spine
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.measurement import joint_stddev
 from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
@@ -375,7 +376,7 @@ def measure(job: tuple[Clip, ArmLaw, float, Methods]) -> dict[str, Any]:
     clip, law, of_bones, methods = job
     skeletons = clip.skeletons
     vicon = vicon_arm(clip.folder / f"{clip.name}_vicon.csv.gz")
-    corrected = [corrected_arms(each, law) for each in skeletons]
+    corrected = [corrected_spine(corrected_arms(each, law)) for each in skeletons]
     outputs = {
         name: filtered(corrected if with_law else skeletons, own, of_bones, lag)
         for name, (own, with_law, lag) in methods.items()

@@ -68,7 +68,7 @@ def ekf_stage(sensor: str, orientations: Sequence[str] = ()) -> FilterStage:
     """The filter ``ekf`` behind one sensor's skeletons and the inertial sensors of these segments."""
     # a mesh is no Kinect, whose arms the filter would turn
     values = {"filter": "ekf", "sensors": (sensor,), "orientations": tuple(orientations)}
-    own = {} if sensor == SENSOR else {"kinect_arms": False}
+    own = {} if sensor == SENSOR else {"kinect_v2": False}
     return FilterStage(check_all(FilterStage.PARAMETERS, {**values, **own}))
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from body_tracking.calibration.arm_directions import corrected_arms
+from body_tracking.calibration.kinect_spine import corrected_spine
 from body_tracking.core.clocks import ClockModel, jumped_back
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.orientation import SegmentOrientation
@@ -62,8 +63,8 @@ class FilterSettings:
         order_wait: greatest time in seconds that a sensor's frame waits for an older one.
         people: selection of people.
         lag: seconds by which frames are held back to be smoothed; 0 for none.
-        kinect_arms: whether the skeletons are of a Kinect v2, whose arms err in their directions by a known law; the
-            thesis's filters do not use it.
+        kinect_v2: whether the skeletons are of a Kinect v2, whose arms and spine have known errors; the thesis's
+            filters do not use it.
         not_kinects: sensors to which this does not apply. With fused frames it then applies if there are others.
     """
 
@@ -77,7 +78,7 @@ class FilterSettings:
     predict_after: float = DEFAULT_PREDICT_AFTER
     order_wait: float = DEFAULT_ORDER_WAIT
     people: PeopleParameters = field(default_factory=PeopleParameters)
-    kinect_arms: bool = True
+    kinect_v2: bool = True
     lag: float = 0.0
     not_kinects: Sequence[str] = ()
 
@@ -123,7 +124,7 @@ class PersonFilter:
             self.alignment = SensorAlignment(settings.sensors, settings.reference or None, settings.world)
             if one_of_several is None:
                 self.people = People(settings.sensors, settings.people, self.alignment.reference)
-        corrects = settings.kinect_arms and settings.filter_name not in THESIS_FILTERS
+        corrects = settings.kinect_v2 and settings.filter_name not in THESIS_FILTERS
         self._kinects = set(settings.sensors) - set(settings.not_kinects) if corrects else set()
         self._corrects_fused = corrects and (bool(self._kinects) or not settings.sensors)
         self._ordering = Ordering(settings.sensors, settings.order_wait)
@@ -209,7 +210,7 @@ class PersonFilter:
             now_ns: time of arrival, in a steady clock.
         """
         self.poll(now_ns)
-        skeleton = corrected_arms(skeletons[0]) if self._corrects_fused else skeletons[0]
+        skeleton = _corrected(skeletons[0]) if self._corrects_fused else skeletons[0]
         self._present = True
         if self._model_filter is not None:
             self._take([("", skeleton)], now_ns)
@@ -242,7 +243,7 @@ class PersonFilter:
         else:
             return None
         aligned = None if self.alignment is None else self.alignment.push(sensor, subject)
-        return corrected_arms(aligned) if aligned is not None and sensor in self._kinects else aligned
+        return _corrected(aligned) if aligned is not None and sensor in self._kinects else aligned
 
     def on_orientation(self, measurement: SegmentOrientation, now_ns: int) -> None:
         """Take the orientation of one segment, in ``world`` and in the reference's clock.
@@ -383,3 +384,8 @@ class PersonFilter:
         for topic in (topics.state, topics.stddev, topics.covariance, topics.segments):
             if self._wanted(topic):
                 self._publish(topic, estimate, estimate.stamp_ns)
+
+
+def _corrected(skeleton: Skeleton) -> Skeleton:
+    """A skeleton of a Kinect v2 without the errors that all of them share."""
+    return corrected_spine(corrected_arms(skeleton))

@@ -79,17 +79,17 @@ LAG = Parameter(
     max=MAX_LAG,
     live=True,
 )
-KINECT_ARMS = Parameter(
-    "kinect_arms",
+KINECT_V2 = Parameter(
+    "kinect_v2",
     True,
-    "correct the directions of the arms by the errors of a Kinect v2 against Vicon; false for other sensors. No "
-    "effect on the thesis's filters",
+    "subtract the errors that all Kinects v2 share: those of the arms' directions against Vicon, and of the spine, "
+    "which they see behind its joints; false for other sensors. No effect on the thesis's filters",
     live=True,
 )
 NOT_KINECTS = Parameter(
     "not_kinects",
     (),
-    "sensors to which kinect_arms does not apply; up and replay name those of --depth and --camera here",
+    "sensors to which kinect_v2 does not apply; up and replay name those of --depth and --camera here",
     live=True,
 )
 ORIENTATIONS = Parameter(
@@ -153,7 +153,7 @@ class FilterStage(Stage):
         PREDICT_AFTER,
         LAG,
         ORIENTATIONS,
-        KINECT_ARMS,
+        KINECT_V2,
         NOT_KINECTS,
         *PEOPLE,
         *filter_table(),
@@ -183,7 +183,7 @@ class FilterStage(Stage):
             given["predict_after"],
             given["order_wait"],
             people_from(values),
-            given["kinect_arms"],
+            given["kinect_v2"],
             given["lag"],
             names_in(values["not_kinects"]),
         )
