@@ -13,12 +13,13 @@ same distance, so that the thorax keeps its direction, on which the law of the a
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
-from body_tracking.core.skeleton import FloatArray, IntArray, Joint, Skeleton
+from body_tracking.core.skeleton import IntArray, Joint, Skeleton
 
 BASE_FORWARD: Final = 0.036
 BASE_UP: Final = 0.029
@@ -28,10 +29,12 @@ FORWARD: Final = 0.027
 
 _J = Joint
 _UPPER: Final[IntArray] = np.array([_J.SPINE_MID, _J.SPINE_SHOULDER, _J.NECK, _J.HEAD], dtype=np.intp)
-_BELOW: Final[IntArray] = np.array([_J.SPINE_BASE, _J.SPINE_MID], dtype=np.intp)
-_ABOVE: Final[IntArray] = np.array([_J.SPINE_MID, _J.SPINE_SHOULDER], dtype=np.intp)
-_RIGHT: Final[IntArray] = np.array([_J.HIP_RIGHT, _J.SHOULDER_RIGHT], dtype=np.intp)
-_LEFT: Final[IntArray] = np.array([_J.HIP_LEFT, _J.SHOULDER_LEFT], dtype=np.intp)
+_NEEDED: Final[IntArray] = np.array(
+    [_J.SPINE_BASE, _J.SPINE_MID, _J.SPINE_SHOULDER, _J.HIP_LEFT, _J.HIP_RIGHT, _J.SHOULDER_LEFT, _J.SHOULDER_RIGHT],
+    dtype=np.intp,
+)
+
+_Vector = tuple[float, float, float]
 
 
 def corrected_spine(skeleton: Skeleton) -> Skeleton:
@@ -43,18 +46,23 @@ def corrected_spine(skeleton: Skeleton) -> Skeleton:
         skeleton: in any frame; only its positions change, and only where both axes of the pelvis, or of the thorax, are
             known.
     """
-    positions = np.where(skeleton.valid[:, None], skeleton.positions, np.nan)
-    up = _unit(positions[_ABOVE] - positions[_BELOW])
-    left = positions[_LEFT] - positions[_RIGHT]
-    forward = _unit(np.cross(left, up))
-    base = BASE_FORWARD * forward[0] + BASE_UP * up[0]
-    moved = skeleton.positions.copy()
-    moved[_J.SPINE_BASE] += np.where(np.isfinite(base).all(), base, 0.0)
-    moved[_UPPER] += np.where(np.isfinite(forward[1]).all(), FORWARD * forward[1], 0.0)
-    return replace(skeleton, positions=moved)
+    known = skeleton.valid
+    base, middle, top, *sides = skeleton.positions.take(_NEEDED, axis=0).tolist()
+    measured = known.take(_NEEDED).tolist()
+    positions = skeleton.positions.copy()
+    if measured[0] and measured[1] and measured[3] and measured[4]:
+        up, forward = _axes(base, middle, sides[0], sides[1])
+        positions[_J.SPINE_BASE] += [BASE_FORWARD * f + BASE_UP * u for f, u in zip(forward, up, strict=True)]
+    if measured[1] and measured[2] and measured[5] and measured[6]:
+        _, forward = _axes(middle, top, sides[2], sides[3])
+        positions[_UPPER] += [FORWARD * each for each in forward]
+    return replace(skeleton, positions=positions)
 
 
-def _unit(vectors: FloatArray) -> FloatArray:
-    with np.errstate(invalid="ignore", divide="ignore"):
-        result: FloatArray = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return result
+def _axes(low: list[float], high: list[float], left: list[float], right: list[float]) -> tuple[_Vector, _Vector]:
+    """Unit vectors up and forward; zero where two points are at one place. Scalars take a fifth of arrays' time."""
+    ux, uy, uz = (b - a for a, b in zip(low, high, strict=True))
+    lx, ly, lz = (b - a for a, b in zip(right, left, strict=True))
+    fx, fy, fz = ly * uz - lz * uy, lz * ux - lx * uz, lx * uy - ly * ux
+    up, forward = math.hypot(ux, uy, uz) or 1.0, math.hypot(fx, fy, fz) or 1.0
+    return (ux / up, uy / up, uz / up), (fx / forward, fy / forward, fz / forward)
