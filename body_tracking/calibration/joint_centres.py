@@ -37,7 +37,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -139,8 +139,20 @@ class Offsets:
 _Vector = tuple[float, float, float]
 
 
-def _axes(top: _Vector, middle: _Vector, left: _Vector, right: _Vector) -> tuple[_Vector, _Vector, _Vector]:
-    """Unit vectors forward, left and up of a thorax by its joints; NaN where these are unknown or in one place."""
+def trunk_axes(
+    top: Sequence[float], middle: Sequence[float], left: Sequence[float], right: Sequence[float]
+) -> tuple[_Vector, _Vector, _Vector]:
+    """Unit vectors of a part of the trunk; in scalars, because it runs for each frame of each camera.
+
+    Args:
+        top: (3,) of the thorax SpineShoulder, of the pelvis SpineMid.
+        middle: (3,) SpineMid, or SpineBase.
+        left: (3,) the left shoulder, or hip.
+        right: (3,) the right one.
+
+    Returns:
+        Forward, left and up; NaN where a joint is unknown or two are in one place.
+    """
     ux, uy, uz = _unit(top[0] - middle[0], top[1] - middle[1], top[2] - middle[2])
     ax, ay, az = left[0] - right[0], left[1] - right[1], left[2] - right[2]
     along = ax * ux + ay * uy + az * uz
@@ -157,7 +169,7 @@ def _unit(x: float, y: float, z: float) -> _Vector:
 
 def body_axes(positions: FloatArray) -> FloatArray:
     """(3, 3) rotation from forward, left and up of the thorax to the axes of (25, 3) positions; NaN where unknown."""
-    return np.array(_axes(*positions.take(_THORAX, axis=0).tolist())).T
+    return np.array(trunk_axes(*positions.take(_THORAX, axis=0).tolist())).T
 
 
 def posed(positions: FloatArray, local: FloatArray) -> FloatArray:
@@ -174,7 +186,7 @@ def posed(positions: FloatArray, local: FloatArray) -> FloatArray:
     """
     points = positions.take(LEARNT, axis=0).tolist()
     _, middle, top, *arms = points
-    (fx, fy, fz), (lx, ly, lz), (ux, uy, uz) = _axes(top, middle, arms[0], arms[4])
+    (fx, fy, fz), (lx, ly, lz), (ux, uy, uz) = trunk_axes(top, middle, arms[0], arms[4])
     result = [
         [(fx * x + lx * y + ux * z, fy * x + ly * y + uy * z, fz * x + lz * y + uz * z) for x, y, z in own]
         for own in local.tolist()
@@ -208,7 +220,7 @@ def retained(positions: FloatArray) -> FloatArray:
         positions: (25, 3) metres, any frame, NaN where unknown. An unknown bone is replaced by the one before it.
     """
     points = positions.take(LEARNT, axis=0).tolist()
-    _, (lx, ly, lz), _ = _axes(points[2], points[1], points[3], points[7])
+    _, (lx, ly, lz), _ = trunk_axes(points[2], points[1], points[3], points[7])
     result = [1.0] * len(points)
     for first, side in ((len(_TRUNK), 1.0), (len(_TRUNK) + 4, -1.0)):
         ux, uy, uz = math.nan, math.nan, math.nan
