@@ -43,6 +43,9 @@ LABELS = (
     """() => Object.values(window.__viserSceneTree.getState()).map(each => each.message.props.text).filter(Boolean)"""
 )
 
+SHOWN = """prefix => Object.entries(window.__viserSceneTree.getState()).some(
+  ([name, node]) => name.startsWith(prefix) && node?.effectiveVisibility)"""
+
 OUT_OF_REACH = """roles => roles.flatMap(role => Array.from(document.querySelectorAll(role))).filter(each => {
   each.scrollIntoView({block: "center"});
   const box = each.getBoundingClientRect();
@@ -114,6 +117,10 @@ class Browser:
     def labels(self) -> list[str]:
         """The names in the scene."""
         return list(self.page.evaluate(LABELS))
+
+    def shows(self, prefix: str) -> bool:
+        """Whether the scene has a visible node whose name begins so."""
+        return bool(self.page.evaluate(SHOWN, prefix))
 
     def press(self, button: str) -> None:
         self.page.get_by_role("button", name=button, exact=True).dispatch_event("click")
