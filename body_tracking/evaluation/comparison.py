@@ -236,7 +236,7 @@ def _notes(estimate: Recorded, truth: Recorded) -> list[str]:
     notes = list(dict.fromkeys((*estimate.warnings, *truth.warnings)))
     for only, where in ((mine & ~theirs, estimate), (theirs & ~mine, truth)):
         if only.any():
-            notes.append(f"not compared, since only {where.source} knows them: {_joints(only)}")
+            notes.append(f"not compared, since only the recording {where.source} has these joints: {_joints(only)}")
     for each in (estimate, truth):
         missing = ~known(each.positions[:, mine & theirs])
         if missing.any():

@@ -328,6 +328,11 @@ def read_estimate(path: Path, topic: str | None = None, body: str | None = None)
         if topic is None:
             full = [each for each in (graph.FILTERED, graph.FUSED) if each in bag.topics and bag.topics[each].count]
             topic = full[0] if full else graph.FILTERED
+            if topic not in bag.topics and bodies(bag):
+                raise EvaluationError(
+                    f"{path}: joint angles without skeletons, as markers give them; `body_tracking show {path}` "
+                    "compares them with the truth (--truth BAG, if another bag holds it)"
+                )
         made = _recorded(bag, topic, "; make some with replay, or choose one with --topic")
         angles = read_angles(bag, body)[1] if body is not None or bodies(bag) else None
         return replace(made, angles=angles, sensors=_sensors(bag, graph.CALIBRATION, graph.CALIBRATION_CLOCK))

@@ -136,6 +136,7 @@ def test_fused_skeletons_are_judged_where_asked_or_where_there_are_no_others(
             r"do not overlap in time: .*two from 1\.000 to 1\.000 s, .*from 17500000",
         ),
         (["{twist}"], r"no topic /filtered/skeleton \(skeletons there: /ground_truth/skeleton, /kinect1"),
+        (["{angles}"], r"angles: joint angles without skeletons, .*`body_tracking show \S*angles` compares them"),
         (["{wave}", "--topic", "/calibration"], r"/calibration holds geometry_msgs/msg/TransformStamped, expected"),
         (["{wave}", "--body", "bob"], r"no joint angles of 'bob' \(there: body1\)"),
         (["{text}"], r"notes\.txt: not an mcap file"),
@@ -160,6 +161,7 @@ def test_bad_input_is_reported_in_one_line(
         "empty": bag_of(tmp_path / "empty", 0),
         "one": bag_of(tmp_path / "one", 1),
         "two": bag_of(tmp_path / "two", 2),
+        "angles": bag_of(tmp_path / "angles", 1, "/humans/bodies/markers/joint_states", JOINT_STATE),
     }
     assert main(["evaluate", *(argument.format(**places) for argument in arguments)]) == 2
     captured = capsys.readouterr()
