@@ -368,15 +368,16 @@ def run(args: argparse.Namespace) -> int:
         return 0
     for warning in report.warnings:
         print(f"warning: {warning}", file=sys.stderr)
+    speed = report.recording_s / max(report.elapsed_s, 1e-9)
     print(
         f"{report.frames} frames of joint angles from {report.recording_s:.1f} s of recording in "
-        f"{report.elapsed_s:.1f} s ({report.recording_s / max(report.elapsed_s, 1e-9):.0f} times real time)"
+        f"{report.elapsed_s:.1f} s ({speed:.{0 if speed >= 10.0 else 1}f} times real time)"
     )
     for line in summary(args.output):
         print(line)
     if args.verbose:
         print(f"left out or noted on the way: {_listed(report.counters)}")
     elif report.counters:
-        print(f"-v prints {len(report.counters)} counters, such as frames, gated joints and accepted T-poses")
+        print(f"-v prints {len(report.counters)} counters of what was used, left out or noted")
     print(f"written to {args.output}")
     return 0
