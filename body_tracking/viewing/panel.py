@@ -64,6 +64,8 @@ class ControlPanel:
             self._convention = self._choice("angles", conventions, self._controls.choose_convention)
             self._body = self._choice("person", (NONE,), self._controls.choose_body)
             self._groups["skeleton_filter"], self._groups["joint_angles"] = [self._filter], [self._convention]
+        self._running: dict[str, str] = {}
+        """What skeleton_filter and joint_angles last said that they run."""
         self._moved, self._resting = -_HELD_S, threading.Timer(0.0, lambda: None)
         self._place.on_update(self._on_place)
         self._loop.on_update(self._on_loop)
@@ -78,8 +80,10 @@ class ControlPanel:
                 show(each, node in there)
         for node, dropdown in (("skeleton_filter", self._filter), ("joint_angles", self._convention)):
             running = there[node].text.partition(" ")[0] if node in there else ""
-            if running in dropdown.options and dropdown.value != running:
+            # Only a change: until the node has taken a user's choice, it says what it ran before.
+            if running in dropdown.options and running != self._running.get(node):
                 dropdown.value = running
+                self._running[node] = running
         if (player := there.get(PLAYER)) is not None:
             self._follow(player)
 
@@ -134,12 +138,14 @@ class ControlPanel:
         @dropdown.on_update
         def _(event: viser.GuiEvent[Any]) -> None:
             if event.client is not None:  # None for updates by draw and draw_bodies
-                self._answer(label, lambda: choose(dropdown.value))
+                chosen = dropdown.value
+                if not self._answer(label, lambda: choose(chosen)):
+                    self._running.clear()  # so that the lists show again what runs
 
         return dropdown
 
-    def _answer(self, what: str, ask: Callable[[], str]) -> None:
-        """Show all clients the request, and then its answer or the reason of its refusal."""
+    def _answer(self, what: str, ask: Callable[[], str]) -> bool:
+        """Show all clients the request, and then its answer or the reason of its refusal; False if it was refused."""
         clients = self._server.get_clients().values()
         notes = [client.add_notification(what, "waits for an answer", loading=True) for client in clients]
         try:
@@ -149,3 +155,4 @@ class ControlPanel:
         for note in notes:
             note.body, note.color = text, "red" if refused else "teal"
             note.loading, note.auto_close_seconds = False, 8.0
+        return not refused
