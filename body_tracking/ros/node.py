@@ -518,8 +518,9 @@ class GraphNode(BatchNode):
         if dropped:
             self._reported_dropped = Counter(self.backlog.dropped)
             counts = ", ".join(f"{count} frames of {topic}" for topic, count in sorted(dropped.items()))
-            level, text = max(level, 1), f"too slow: dropped {counts}" + (f"; {text}" if text else "")
-            self.log_throttled("dropped", text)
+            problem = f"too slow: dropped {counts}"
+            level, text = max(level, 1), problem + (f"; {text}" if text else "")
+            self.log_throttled("dropped", problem)
         failures = self.monitor.failures.total()
         if failures > self._reported_failures:
             self._reported_failures = failures
