@@ -65,7 +65,7 @@ class ControlPanel:
             self._body = self._choice("person", (NONE,), self._controls.choose_body)
             self._groups["skeleton_filter"], self._groups["joint_angles"] = [self._filter], [self._convention]
         self._running: dict[str, str] = {}
-        """What skeleton_filter and joint_angles last said that they run."""
+        """What skeleton_filter and joint_angles last said that they run, and whether the player loops."""
         self._moved, self._resting = -_HELD_S, threading.Timer(0.0, lambda: None)
         self._place.on_update(self._on_place)
         self._loop.on_update(self._on_loop)
@@ -95,7 +95,9 @@ class ControlPanel:
             self._place.max = last
         if time.monotonic() - self._moved > _HELD_S:
             self._place.value = min(max(0.0, round(place, 1)), self._place.max)
-            self._loop.value = player.values.get("loop") == "True"
+        loops = player.values.get("loop", "")
+        if loops != self._running.get(PLAYER):
+            self._loop.value, self._running[PLAYER] = loops == "True", loops
 
     def draw_bodies(self, bodies: Sequence[str], chosen: str) -> None:
         """Update the list of persons with angles."""
@@ -119,8 +121,9 @@ class ControlPanel:
 
     def _on_loop(self, event: viser.GuiEvent[Any]) -> None:
         if event.client is not None:
-            self._moved = time.monotonic()
-            self._answer("bag: loop", lambda: self._controls.loop(bool(self._loop.value)))
+            wanted = bool(self._loop.value)
+            if not self._answer("bag: loop", lambda: self._controls.loop(wanted)):
+                self._running.clear()
 
     def _buttons(self, label: str, services: Mapping[str, str]) -> Any:
         buttons = self._server.gui.add_button_group(label, tuple(services), visible=False)

@@ -15,13 +15,13 @@ from body_tracking.viewing.panel import ControlPanel
 from body_tracking.viewing.snapshot import PageError
 
 
-class Dropdown(SimpleNamespace):
-    """A list of the page, in which a user can choose."""
+class Choice(SimpleNamespace):
+    """A list or a box of the page, in which a user can choose."""
 
     def on_update(self, called: Any) -> None:
         self.called = called
 
-    def receive(self, value: str) -> None:
+    def receive(self, value: object) -> None:
         """The user's choice arrives."""
         self.value = value
 
@@ -33,20 +33,24 @@ class Dropdown(SimpleNamespace):
 @pytest.fixture
 def page() -> SimpleNamespace:
     """A panel with the lists of filters and conventions, and the controls that it calls."""
-    lists: dict[str, Dropdown] = {}
+    lists: dict[str, Choice] = {}
 
-    def add_dropdown(label: str, options: tuple[str, ...]) -> Dropdown:
-        return lists.setdefault(label, Dropdown(options=options, value=options[0], visible=True))
+    def add_dropdown(label: str, options: tuple[str, ...]) -> Choice:
+        return lists.setdefault(label, Choice(options=options, value=options[0], visible=True))
 
     server, controls = MagicMock(), MagicMock()
     server.gui.add_dropdown.side_effect = add_dropdown
+    server.gui.add_slider.return_value = Choice(value=0.0, max=1.0, visible=True)
+    server.gui.add_checkbox.return_value = loop = Choice(value=False, visible=True)
     server.get_clients.return_value = {}
     panel = ControlPanel(server, controls, ("lkf", "ekf"), ("positional", "model", "isb"))
 
-    def report(convention: str) -> None:
-        panel.draw({"joint_angles": NodeStatus("joint_angles: angles", 0, f"{convention} angles")}, 0.0, False)
+    def report(convention: str, loops: bool = False) -> None:
+        angles = NodeStatus("joint_angles: angles", 0, f"{convention} angles")
+        player = NodeStatus("bag_player: bag", 0, "playing", {"loop": str(loops), "duration s": "15.4"})
+        panel.draw({"joint_angles": angles, "bag_player": player}, 0.0, False)
 
-    return SimpleNamespace(angles=lists["angles"], controls=controls, report=report)
+    return SimpleNamespace(angles=lists["angles"], loop=loop, controls=controls, report=report)
 
 
 def test_a_choice_is_not_undone_by_a_report_of_what_ran_before(page: SimpleNamespace) -> None:
@@ -61,6 +65,18 @@ def test_a_choice_is_not_undone_by_a_report_of_what_ran_before(page: SimpleNames
     page.report("isb")
     page.report("positional")  # another program set it
     assert page.angles.value == "positional"
+
+
+def test_a_click_on_loop_is_not_undone_by_a_report_of_before(page: SimpleNamespace) -> None:
+    page.report("model", loops=False)
+    page.loop.receive(True)
+    page.report("model", loops=False)
+    page.loop.handle()
+    page.controls.loop.assert_called_once_with(True)
+    page.report("model", loops=True)
+    assert page.loop.value is True
+    page.report("model", loops=False)
+    assert page.loop.value is False
 
 
 def test_after_a_refusal_the_list_shows_what_runs(page: SimpleNamespace) -> None:
