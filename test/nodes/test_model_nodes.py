@@ -191,6 +191,9 @@ def test_without_inputs_the_filter_predicts_and_then_stops(tracking: Tracking) -
         real = [number for number, each in enumerate(seen) if (each.states == TrackingState.TRACKED).any()]
         return seen[real[-1] + 1 :] if real else []
 
+    def lasted(predicted: list[Skeleton]) -> int:
+        return predicted[-1].stamp_ns - predicted[0].stamp_ns
+
     # 30 a second, from 0.3 s to the 2 s that the filter allows itself; messages are best effort, and a busy machine
     # loses some, or holds up a frame of a sensor until the filter has predicted its time already
     for _ in range(4):
@@ -201,15 +204,14 @@ def test_without_inputs_the_filter_predicts_and_then_stops(tracking: Tracking) -
         tracking.until(lambda: False, timeout=2.5)
         predicted = predicted_ones()
         # one that came too late is no real one, and the 2 s count from it all the same
-        if 15 <= len(predicted) <= 52:
+        if 15 <= len(predicted) <= 52 and 1.0 * NANOSECONDS <= lasted(predicted) <= 1.8 * NANOSECONDS:
             break
     assert 15 <= len(predicted) <= 55
     assert all((each.states <= TrackingState.INFERRED).all() for each in predicted)
     steps = np.diff([each.stamp_ns for each in predicted]) / (NANOSECONDS / 30)
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
     assert (steps >= 0.5).all()
-    lasted = predicted[-1].stamp_ns - predicted[0].stamp_ns
-    assert 1.0 * NANOSECONDS <= lasted <= 1.8 * NANOSECONDS
+    assert 1.0 * NANOSECONDS <= lasted(predicted) <= 1.8 * NANOSECONDS
     assert len(set(stamps(tracking.angles)) & {each.stamp_ns for each in predicted}) >= 10
     assert tracking.number("skeleton_filter", "predicted frames") >= len(predicted)
     assert predicted[0].covariances is not None
@@ -274,8 +276,8 @@ def test_invalid_state_or_covariance_is_counted(tracking: Tracking) -> None:
     assert f"{STATE}: malformed message ignored" in tracking.log("joint_angles")
     assert f"{COVARIANCE}: malformed message ignored" in tracking.log("joint_angles")
     tracking.cut_short()
-    tracking.play(10)
-    assert tracking.until(lambda: tracking.angles)
+    # some may come too late for a filter that has predicted their time already
+    assert tracking.play_until(lambda: tracking.angles)
 
 
 def test_change_of_filter_keeps_the_sensor_poses(tracking: Tracking) -> None:
