@@ -49,15 +49,22 @@ def rigs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rigs]:
 
 
 def test_services_are_listed_with_what_they_do(rigs: Rigs) -> None:
-    code, printed, error = rigs.say()
-    listed = dict(line.split(maxsplit=1) for line in printed.splitlines())
-    assert code == 0 and not error
+    for _ in range(5):  # on a busy machine a node may be discovered only after the others' list has settled
+        code, printed, error = rigs.say()
+        listed = dict(line.split(maxsplit=1) for line in printed.splitlines())
+        assert code == 0 and not error
+        if {"calibration/start", "lab/calibration/start", "recorder/stop"} <= listed.keys():
+            break
     assert listed["calibration/start"].startswith("estimate the poses anew")
     assert listed["lab/calibration/start"] == listed["calibration/start"]
     assert listed["recorder/stop"] == "stop recording and close the bag"
     assert "mesh_tracker/personalise" not in listed, "no node offers it"
-    code, printed, error = rigs.say("--namespace", "lab")
-    assert [line.split()[0] for line in printed.splitlines()] == ["calibration/reset", "calibration/start"]
+    for _ in range(5):
+        code, printed, error = rigs.say("--namespace", "lab")
+        names = [line.split()[0] for line in printed.splitlines()]
+        if len(names) >= 2:
+            break
+    assert names == ["calibration/reset", "calibration/start"]
 
 
 @pytest.mark.parametrize(
