@@ -1,8 +1,9 @@
 """A real Kinect v2 against Vicon: arm elevation and elbow flexion, raw and filtered, in degrees.
 
 The clips are exercises of the right arm of five people (UI-PRMD, Vakanski et al. 2018), each recorded by both systems.
-Filters run with and without the law of the arms' directions (``calibration.arm_directions``), which is fitted leaving
-out the subject it is tried on; ``--fit`` prints the law of all subjects, which is the shipped one. The table holds the
+Filters run with and without the correction of a Kinect's arms and spine (``calibration.arm_directions``,
+``calibration.kinect_spine``), of which the law of the arms is fitted leaving out the subject it is tried on; ``--fit``
+prints the law of all subjects, which is the shipped one. The table holds the
 median over subjects of their clips' medians, and of these the ratio to the raw skeleton; stddev is the median of the
 published standard deviations (linear filters: positional angles; ``ekf``: convention ``isb``), and coverage the share
 of all frames of a subject whose error lies within 1.96 of it, mean over subjects. (Coverage of the median clip, which
@@ -10,7 +11,9 @@ the last column shows, is no measure of it: errors persist throughout a clip, so
 frames inside although those of all clips together have 95 %.) The linear filters' deviations depend on the correlation
 of neighbouring joints' errors (``core.measurement``), which is fitted without that subject, too; ``ekf`` has the
 shipped one. Rate is the RMS of the angle's error differentiated by time, degrees per second; ``--lag`` adds rows with
-smoothing (``filters.smoothing``). Clips whose time warp explains less than 0.9 are left out.
+smoothing (``filters.smoothing``). Clips whose time warp explains less than 0.9 are left out. Last, for the rows of
+``ekf``, the flexion of the trunk against the pelvis (convention ``model``) of these people, who stand upright: the
+median over the second halves of a subject's clips.
 
 Angles. Elevation: upper arm against the trunk axis, 0 hanging; flexion: forearm against upper arm, 0 straight. Kinect:
 the lines between the joints, trunk axis from SpineMid to SpineShoulder. Vicon: from joint centres that are computed
@@ -44,7 +47,7 @@ from scipy.optimize import brentq
 from time_warp import TimeWarp, compare, estimate_warp
 
 from body_tracking.calibration.arm_directions import ArmLaw, corrected_arms, fit_arm_law
-from body_tracking.calibration.kinect_spine import corrected_spine
+from body_tracking.calibration.kinect_spine import corrected_kinect
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.measurement import joint_stddev
 from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
@@ -221,11 +224,13 @@ class Filtered:
         skeletons: one per frame.
         published: (n, 2) degrees: the published elevation and flexion of the right arm.
         stddev: (n, 2) degrees, of these.
+        trunk: degrees, median flexion of the trunk in the second half; NaN without a body model.
     """
 
     skeletons: list[Skeleton]
     published: FloatArray
     stddev: FloatArray
+    trunk: float
 
 
 def _outputs(
@@ -252,18 +257,21 @@ def filtered(skeletons: list[Skeleton], name: str, of_bones: float, lag: float =
     """Run a filter over skeletons; ``of_bones`` as of ``positional_angles``, the lag of smoothing in s."""
     chosen = make_filter(name)
     found, angles = [], None
-    published, stddev = [], []
+    published, stddev, trunk = [], [], []
     for out, estimate in _outputs(skeletons, chosen, lag):
         if isinstance(chosen, ModelFilter):
             assert estimate is not None
             angles = angles_of(estimate, chosen.model, "isb", angles)
+            own = angles_of(estimate, chosen.model, "model")
+            trunk.append(np.degrees(own.position[own.names.index("trunk_flexion")]))
         else:
             angles = positional_angles(out, of_bones)
         columns = [angles.names.index(name) for name in _NAMES]
         found.append(out)
         published.append(np.abs(np.degrees(angles.position[columns])))  # ISB's elevation is negative
         stddev.append(np.degrees(angles.position_stddev[columns]))
-    return Filtered(found, np.array(published), np.array(stddev))
+    bent = float(np.median(trunk[len(trunk) // 2 :])) if trunk else float("nan")
+    return Filtered(found, np.array(published), np.array(stddev), bent)
 
 
 def align(arms: list[Arm], vicon: Arm, clip: str) -> TimeWarp:
@@ -376,7 +384,7 @@ def measure(job: tuple[Clip, ArmLaw, float, Methods]) -> dict[str, Any]:
     clip, law, of_bones, methods = job
     skeletons = clip.skeletons
     vicon = vicon_arm(clip.folder / f"{clip.name}_vicon.csv.gz")
-    corrected = [corrected_spine(corrected_arms(each, law)) for each in skeletons]
+    corrected = [corrected_kinect(each, law) for each in skeletons]
     outputs = {
         name: filtered(corrected if with_law else skeletons, own, of_bones, lag)
         for name, (own, with_law, lag) in methods.items()
@@ -388,6 +396,8 @@ def measure(job: tuple[Clip, ArmLaw, float, Methods]) -> dict[str, Any]:
     for name, arm in arms.items():
         at = warp(arm.times)
         figures[name] = {"lag_s": lag(arm, arms[RAW])}
+        if name in outputs:
+            figures[name]["trunk"] = outputs[name].trunk
         for column, angle in enumerate(ANGLES):
             true = sample(at, vicon.times, getattr(vicon, angle))
             figures[name][angle] = asdict(compare(getattr(arm, angle), true))
@@ -430,8 +440,13 @@ def main() -> int:
     jobs = [(each, laws[each.subject], correlations[each.subject], methods) for each in clips]
     rows = common.mapped(measure, jobs, args.jobs)
     table = {name: {angle: _summary(rows, subjects, name, angle) for angle in ANGLES} for name in (RAW, *methods)}
-    figures = {"clips": rows, "table": table, "correlations": correlations}
-    common.report(args, figures, lambda: show(table, len(clips), len(files), correlations))
+    trunks = {
+        name: [median(row[name]["trunk"] for row in rows if row["subject"] == each) for each in subjects]
+        for name in methods
+        if name.startswith("ekf")
+    }
+    figures = {"clips": rows, "table": table, "correlations": correlations, "trunks": trunks}
+    common.report(args, figures, lambda: show(table, len(clips), len(files), correlations, trunks))
     return common.verdicts(args, _bars(table))
 
 
@@ -470,8 +485,14 @@ def _bars(table: dict[str, dict[str, dict[str, Any]]]) -> dict[str, bool]:
     return bars
 
 
-def show(table: dict[str, dict[str, dict[str, Any]]], used: int, of: int, correlations: dict[str, float]) -> None:
-    """The table."""
+def show(
+    table: dict[str, dict[str, dict[str, Any]]],
+    used: int,
+    of: int,
+    correlations: dict[str, float],
+    trunks: dict[str, list[float]],
+) -> None:
+    """The table, errors by subject, and the trunks."""
     print(f"{used} of {of} clips, {len(correlations)} subjects; degrees")
     print("correlation of a bone's joints without each: " + " ".join(f"{each:.3f}" for each in correlations.values()))
     columns = (
@@ -487,6 +508,8 @@ def show(table: dict[str, dict[str, dict[str, Any]]], used: int, of: int, correl
             f"{name:<34}"
             + "   ".join(" ".join(f"{each:5.1f}" for each in angles[angle]["subjects"]) for angle in ANGLES)
         )
+    for name, bent in trunks.items():
+        print(f"{f'trunk_flexion, {name}':<34}" + " ".join(f"{each:5.1f}" for each in bent))
 
 
 def _line(own: dict[str, Any]) -> str:

@@ -31,8 +31,7 @@ import common
 import numpy as np
 from kinect_vs_vicon import kinect_skeletons
 
-from body_tracking.calibration.arm_directions import corrected_arms
-from body_tracking.calibration.kinect_spine import corrected_spine
+from body_tracking.calibration.kinect_spine import corrected_kinect
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray
 from body_tracking.evaluation.metrics import wrapped
 from body_tracking.evaluation.reading import AngleSeries, read
@@ -176,7 +175,7 @@ def of_replays(job: Job) -> dict[str, dict[str, Any]]:
 def of_clip(job: Job) -> dict[str, dict[str, Any]]:
     """The figures of a clip with each filter."""
     assert job.file is not None
-    skeletons = [corrected_spine(corrected_arms(each)) for each in kinect_skeletons(job.file)]
+    skeletons = [corrected_kinect(each) for each in kinect_skeletons(job.file)]
     found = {}
     for name in FILTERS:
         chosen, series, last = make_filter(name), [], None

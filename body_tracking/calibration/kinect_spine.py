@@ -1,14 +1,15 @@
 """Where a Kinect v2 sees the spine: behind the centres of its joints, alike for everybody.
 
-The skeleton of the SDK has SpineBase 36 mm behind the middle of the hips and level with it, in eight people of two
-data sets (medians per person 34 to 48 mm behind, 4 below to 4 above). In a body the joint of the lumbar spine lies
+The skeleton of the SDK has SpineBase 36 mm behind the middle of the hips and level with it: 35.5 to 37.7 mm in each of
+five people (UI-PRMD), 34 to 38 in eight of nine recordings of three others, 48 in the ninth; 4 mm below to 4 above. In
+a body the joint of the lumbar spine lies
 above the middle of the hip joints. Taken for it, the Kinect's SpineBase tilts the pelvis of an upright person backward,
 so that the trunk seems to be bent forward against it by 15 to 21 degrees. SpineShoulder lies 27 mm farther behind the
 shoulders than by Vicon (UI-PRMD, five people); Schlagenhauf (2017), table E.1, has all of the spine 31 to 62 mm behind
 and its base 30 mm below the anatomical joints.
 
-So SpineBase is moved forward and up in the axes of the pelvis, and all above it forward in those of the thorax, by the
-same distance, so that the thorax keeps its direction, on which the law of the arms rests.
+So SpineBase is moved forward and up in the axes of the pelvis. The joints above it are moved forward in the axes of the
+thorax, all by one distance: the thorax keeps its direction, on which the law of the arms (`arm_directions`) rests.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from typing import Final
 
 import numpy as np
 
+from body_tracking.calibration.arm_directions import KINECT_V2, ArmLaw, corrected_arms
 from body_tracking.calibration.joint_centres import trunk_axes
 from body_tracking.core.skeleton import IntArray, Joint, Skeleton
 
@@ -36,10 +38,21 @@ _NEEDED: Final[IntArray] = np.array(
 )
 
 
+def corrected_kinect(skeleton: Skeleton, law: ArmLaw = KINECT_V2) -> Skeleton:
+    """A skeleton of a Kinect v2 without the errors that all of them share, those of the arms and of the spine.
+
+    Args:
+        skeleton: in any frame; only its positions change.
+        law: of the directions of the arms.
+    """
+    return corrected_spine(corrected_arms(skeleton, law))
+
+
 def corrected_spine(skeleton: Skeleton) -> Skeleton:
     """A skeleton of a Kinect v2 with the spine at the centres of its joints.
 
-    To be used before left and right are put right: the Kinect places the spine behind what it takes for the front.
+    A sensor's own frame is corrected before its left and right are swapped, since the Kinect places the spine behind
+    what it takes for the front; a fused frame, whose sides fusion has corrected, as it is.
 
     Args:
         skeleton: in any frame; only its positions change, and only where both axes of the pelvis, or of the thorax, are

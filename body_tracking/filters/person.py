@@ -6,8 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from body_tracking.calibration.arm_directions import corrected_arms
-from body_tracking.calibration.kinect_spine import corrected_spine
+from body_tracking.calibration.kinect_spine import corrected_kinect
 from body_tracking.core.clocks import ClockModel, jumped_back
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.orientation import SegmentOrientation
@@ -210,7 +209,7 @@ class PersonFilter:
             now_ns: time of arrival, in a steady clock.
         """
         self.poll(now_ns)
-        skeleton = _corrected(skeletons[0]) if self._corrects_fused else skeletons[0]
+        skeleton = corrected_kinect(skeletons[0]) if self._corrects_fused else skeletons[0]
         self._present = True
         if self._model_filter is not None:
             self._take([("", skeleton)], now_ns)
@@ -243,7 +242,7 @@ class PersonFilter:
         else:
             return None
         aligned = None if self.alignment is None else self.alignment.push(sensor, subject)
-        return _corrected(aligned) if aligned is not None and sensor in self._kinects else aligned
+        return corrected_kinect(aligned) if aligned is not None and sensor in self._kinects else aligned
 
     def on_orientation(self, measurement: SegmentOrientation, now_ns: int) -> None:
         """Take the orientation of one segment, in ``world`` and in the reference's clock.
@@ -384,8 +383,3 @@ class PersonFilter:
         for topic in (topics.state, topics.stddev, topics.covariance, topics.segments):
             if self._wanted(topic):
                 self._publish(topic, estimate, estimate.stamp_ns)
-
-
-def _corrected(skeleton: Skeleton) -> Skeleton:
-    """A skeleton of a Kinect v2 without the errors that all of them share."""
-    return corrected_spine(corrected_arms(skeleton))

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from body_tracking.calibration.arm_directions import corrected_arms
 from body_tracking.calibration.joint_centres import body_axes
-from body_tracking.calibration.kinect_spine import corrected_spine
+from body_tracking.calibration.kinect_spine import corrected_kinect, corrected_spine
 from body_tracking.core.skeleton import MIRROR, FloatArray, Joint, Skeleton, TrackingState
 from body_tracking.filters import ModelFilter, make_filter
 from body_tracking.kinematics.conventions import angles_of
@@ -49,7 +48,7 @@ def test_real_people_have_their_spine_above_the_hips_and_stand_upright(shared_da
     assert isinstance(filter_, ModelFilter)
     flexion, angles = [], None
     for each in seen:
-        filter_.update(corrected_spine(corrected_arms(each)))
+        filter_.update(corrected_kinect(each))
         if filter_.estimate is not None:
             angles = angles_of(filter_.estimate, filter_.model, "model", angles)
             flexion.append(np.degrees(angles.position[angles.names.index("trunk_flexion")]))
