@@ -28,7 +28,10 @@ _FINE = 0.5
 """Degrees of deviation below which errors have panels of their own."""
 _VIEW = np.radians(25.0)
 """Angle of the view from the person's front, so that depth is visible."""
-LEGEND = "left blue, right orange, band 1.96 standard deviations, truth dashed; no line where the angle is unknown"
+
+
+def _legend(dashed: str = ", truth dashed") -> str:
+    return f"left blue, right orange, band 1.96 standard deviations{dashed}; no line where the angle is unknown"
 
 
 def draw(tracked: Tracked, path: Path) -> None:
@@ -45,7 +48,8 @@ def draw(tracked: Tracked, path: Path) -> None:
     heights = [3.6] * bool(tracked.skeletons) + [_height(each.names) for each in shown]
     figure = figure_of(0.3 + sum(heights))
     parts = figure.subfigures(len(heights), 1, height_ratios=heights) if len(heights) > 1 else (figure,)
-    figure.suptitle(f"{tracked.bag.name}: {len(known)} frames, {tracked.duration:.1f} s; {LEGEND}", fontsize=11)
+    legend = _legend() if np.isfinite(true).any() else _legend("")
+    figure.suptitle(f"{tracked.bag.name}: {len(known)} frames, {tracked.duration:.1f} s; {legend}", fontsize=11)
     if tracked.skeletons:
         _draw_person(parts[0], tracked, start_ns)
     for part, each in zip(parts[-len(shown) :], shown, strict=True):
@@ -65,7 +69,7 @@ def pictures(result: Evaluation) -> list[tuple[str, str]]:
     angles = first.named if first.named is not None and not named_are_positional(result) else first.positional
     drawn = [
         (f"Distance of each joint from the truth, mm, {first.name}; white: not known in both", _errors(result)),
-        (f"Angles, degrees, {first.name}; {LEGEND}", _angle_picture(angles)),
+        (f"Angles, degrees, {first.name}; {_legend()}", _angle_picture(angles)),
     ]
     if result.calibration:
         drawn.append(("Calibration over time against the true one", _calibration(result)))
@@ -74,7 +78,7 @@ def pictures(result: Evaluation) -> list[tuple[str, str]]:
 
 def reference_pictures(angles: AngleComparison) -> list[tuple[str, str]]:
     """The same of an evaluation by the marker system, given its angles."""
-    return [(f"Angles, degrees; {LEGEND}", _angle_picture(angles))] if angles.names else []
+    return [(f"Angles, degrees; {_legend()}", _angle_picture(angles))] if angles.names else []
 
 
 def _angle_picture(angles: AngleComparison) -> str:
@@ -193,10 +197,8 @@ def _draw_person(figure: Any, tracked: Tracked, start_ns: int) -> None:
         axis.set_title(f"{(skeleton.stamp_ns - start_ns) / NANOSECONDS:.1f} s", fontsize=9)
         axis.set_aspect("equal")
         axis.axis("off")
-    legend = (
-        "left blue, right orange, truth grey (moved and turned onto the estimate); circles: not tracked by any sensor"
-    )
-    figure.supxlabel(legend, fontsize=8)
+    grey = ", truth grey (moved and turned onto the estimate)" if pairs else ""
+    figure.supxlabel(f"left blue, right orange{grey}; circles: not tracked by any sensor", fontsize=8)
 
 
 def _draw_bones(axis: Any, points: FloatArray, **style: Any) -> None:
