@@ -22,6 +22,7 @@ from body_tracking.core.skeleton import (
     Skeleton,
     TrackingState,
 )
+from body_tracking.evaluation.metrics import wrapped
 from body_tracking.filters.ekf.filter import ExtendedKalmanFilter
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.kinematics.compiled_posture import prior_rows, prior_table
@@ -281,6 +282,33 @@ def test_another_person_of_another_size_is_learnt_anew() -> None:
     estimator = ExtendedKalmanFilter()
     feed(estimator, skeletons)
     assert_allclose(known(estimator).lengths, 0.65 * truth.lengths, rtol=0.0, atol=0.02)
+
+
+def test_a_pose_that_jumps_states_how_far() -> None:
+    """After a jump the deviations say that either pose may be wrong: a camera moves an arm elsewhere for 0.6 s."""
+    jumps, misleading = 0, 0
+    for seed in range(draws(10, 60)):
+        rng = np.random.default_rng([seed, 7])
+        truth = random_truth(seed, 3.2)
+        offset = rng.normal(size=3)
+        offset *= 0.35 / np.linalg.norm(offset)
+        side = rng.choice(["LEFT", "RIGHT"])
+        arm = [Joint[f"{joint}_{side}"] for joint in ("ELBOW", "WRIST", "HAND", "THUMB")]
+        estimator, angles = ExtendedKalmanFilter(), None
+        found = []
+        for skeleton, time in zip(measured(truth).skeletons, truth.times, strict=True):
+            if 2.0 < time < 2.6:
+                positions = skeleton.positions.copy()
+                positions[arm] += offset
+                skeleton = replace(skeleton, positions=positions)
+            if estimator.take(skeleton) and time > 1.9:
+                angles = angles_of(known(estimator), MODEL, "model", angles)
+                found.append((angles.position, angles.position_stddev))
+        position, stddev = np.array(found).swapaxes(0, 1)
+        far = np.abs(wrapped(np.diff(position, axis=0))) > np.radians(60.0)
+        jumps += int(far.sum())
+        misleading += int((far & (np.maximum(stddev[1:], stddev[:-1]) < np.radians(15.0))).sum())
+    assert jumps >= 10 and misleading == 0, (jumps, misleading)
 
 
 ORIGIN = np.array([-3.0, 5.0, 0.7])

@@ -88,12 +88,14 @@ class Motion:
             share = advance(p, space.size, sources, dt)
             crosses.reshape(len(p), -1)[space.size :].reshape(len(sources), PER_SOURCE, -1)[:, 4:] *= share
             sources = sources.faded(share)
+        believed = math.exp(-dt / max(self._parameters.reacquire_after, 1e-3))
         return state.but(
             stamp_ns=stamp_ns,
             q=q,
             velocity=fade * state.velocity,
             covariance=p,
             crosses=crosses,
+            corrected=believed * state.corrected,
             since_prior=state.since_prior + dt,
             tracked=state.tracked + dt,
             fresh=False,

@@ -46,7 +46,8 @@ class EkfParameters(OrientationParameters):
     )
     reacquire_after: float = number_field(
         0.12,
-        "points rejected without a break for longer than this may start the pose anew, where it fits them",
+        "points rejected without a break for longer than this may start the pose anew, where it fits them; for about "
+        "as long the deviations include how far the new pose is from the one before",
         "s",
         0.0,
         60.0,

@@ -130,6 +130,7 @@ class PoseSearch:
             np.empty((size, 0), dtype=np.float32),
             np.zeros(space.points),
             np.zeros(3 * space.points),
+            np.zeros(space.observed),
             np.full(space.points, stamp_ns, dtype=np.intp),
             0.0,
             0.0 if previous is None else previous.tracked,
@@ -200,12 +201,18 @@ class PoseSearch:
             self._counters["restarts"] += 1
             seen = SegmentLengths(self._parameters.slow_time) if state.settled else state.seen
             state = state.but(settled=False, tracked=0.0, seen=seen)
-            return self.new_state(state.stamp_ns, fresh.q, lengths, stddev, state, keep_lengths=False)
+            started = self.new_state(state.stamp_ns, fresh.q, lengths, stddev, state, keep_lengths=False)
+            return started.but(corrected=self._change(state, started))
         if fit.cost > share * present:
             return state
         self._counters["restarts"] += 1
         fit = self.inverse.solve(points, stddev, state.lengths, fit.q)
-        return self.new_state(state.stamp_ns, fit.q, state.lengths, stddev, state)
+        started = self.new_state(state.stamp_ns, fit.q, state.lengths, stddev, state)
+        return started.but(corrected=self._change(state, started))
+
+    def _change(self, before: State, after: State) -> FloatArray:
+        """(53,) ``State.corrected`` of a new pose."""
+        return np.concatenate([self._model.difference(before.q, after.q), after.lengths - before.lengths])
 
     def _lengths_of(self, points: FloatArray) -> FloatArray:
         """(21,) average proportions at the size of the person that is seen."""

@@ -99,6 +99,8 @@ class State(Changeable):
         rejected_for: (19,) seconds.
         disputed: (57,) metres, innovations of rejected points, times the square root of the share of the time after
             which another pose is searched for; 0 of accepted points.
+        corrected: (53,) of tangent and lengths, by how much another pose that was found differs from the one before:
+            either may be wrong. It fades by ``reacquire_after``, while frames confirm the new one.
         used_ns: (19,) stamp of the last accepted measurement of each point.
         since_prior: seconds since ranges of motion were last applied.
         tracked: seconds since the start.
@@ -124,6 +126,7 @@ class State(Changeable):
     crosses: SingleArray
     rejected_for: FloatArray
     disputed: FloatArray
+    corrected: FloatArray
     used_ns: IntArray
     since_prior: float
     tracked: float
