@@ -66,7 +66,7 @@ class ControlPanel:
             self._groups["skeleton_filter"], self._groups["joint_angles"] = [self._filter], [self._convention]
         self._running: dict[str, str] = {}
         """What skeleton_filter and joint_angles last said that they run, and whether the player loops."""
-        self._moved, self._resting = -_HELD_S, threading.Timer(0.0, lambda: None)
+        self._moved, self._resting = -_HELD_S, threading.Timer(0.0, lambda: None)  # of the server's event loop
         self._place.on_update(self._on_place)
         self._loop.on_update(self._on_loop)
 
@@ -93,11 +93,15 @@ class ControlPanel:
         last = max(0.1, int(10.0 * length) / 10.0)  # not after the last message
         if self._place.max != last:
             self._place.max = last
-        if time.monotonic() - self._moved > _HELD_S:
-            self._place.value = min(max(0.0, round(place, 1)), self._place.max)
+        self._server.get_event_loop().call_soon_threadsafe(self._show_place, min(max(0.0, round(place, 1)), last))
         loops = player.values.get("loop", "")
         if loops != self._running.get(PLAYER):
             self._loop.value, self._running[PLAYER] = loops == "True", loops
+
+    def _show_place(self, place: float) -> None:
+        """In the server's event loop, as :meth:`_on_place`: so it cannot come between a move and the reading of it."""
+        if time.monotonic() - self._moved > _HELD_S:
+            self._place.value = place
 
     def draw_bodies(self, bodies: Sequence[str], chosen: str) -> None:
         """Update the list of persons with angles."""
@@ -107,8 +111,8 @@ class ControlPanel:
         if chosen in options and self._body.value != chosen:
             self._body.value = chosen
 
-    def _on_place(self, event: viser.GuiEvent[Any]) -> None:
-        if event.client is None:  # by draw
+    async def _on_place(self, event: viser.GuiEvent[Any]) -> None:
+        if event.client is None:  # by _show_place
             return
         self._moved = time.monotonic()
         self._resting.cancel()

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
+import threading
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
@@ -12,6 +15,7 @@ pytest.importorskip("viser", reason="viser is not installed")
 
 from body_tracking.messages.node_status import NodeStatus
 from body_tracking.viewing.panel import ControlPanel
+from body_tracking.viewing.server import serve, stop
 from body_tracking.viewing.snapshot import PageError
 
 
@@ -86,3 +90,38 @@ def test_after_a_refusal_the_list_shows_what_runs(page: SimpleNamespace) -> None
     page.angles.handle()
     page.report("model")
     assert page.angles.value == "model"
+
+
+@pytest.fixture
+def server() -> Iterator[Any]:
+    """A server without browsers."""
+    server = serve("127.0.0.1", 0)
+    yield server
+    stop(server)
+
+
+def test_a_move_of_the_slider_is_not_undone_by_a_report_that_comes_before_it_is_read(server: Any) -> None:
+    """The server calls back in one of 32 threads. Here they are busy, as they may be while a page waits for answers."""
+    viser = pytest.importorskip("viser")
+    gui, sought, over = server.gui, threading.Event(), threading.Event()
+    panel = ControlPanel(server, controls := MagicMock(), ("lkf",), ("positional",))
+    controls.seek.side_effect = lambda place: sought.set() or f"plays on from {place} s"
+
+    def report(place: float) -> None:
+        values = {"duration s": "15.4", "position s": str(place), "loop": "False"}
+        panel.draw({"bag_player": NodeStatus("bag_player: bag", 0, "playing", values)}, 0.0, False)
+        asyncio.run_coroutine_threadsafe(asyncio.sleep(0.0), server.get_event_loop()).result(10.0)
+
+    report(2.0)
+    (slider,) = (each for each in gui._gui_input_handle_from_uuid.values() if isinstance(each, viser.GuiSliderHandle))
+    assert slider.value == 2.0
+    for _ in range(server._thread_executor._max_workers):
+        server._thread_executor.submit(over.wait, 10.0)
+    server._connected_clients[1] = MagicMock()
+    move = viser._messages.GuiUpdateMessage(slider._impl.uuid, {"value": 12.0})
+    asyncio.run_coroutine_threadsafe(gui._handle_gui_updates(1, move), server.get_event_loop()).result(10.0)
+    report(3.0)
+    over.set()
+    assert sought.wait(10.0)
+    controls.seek.assert_called_once_with(12.0)
+    assert slider.value == 12.0
