@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from body_tracking.core.qos import Qos
 from body_tracking.core.skeleton import NANOSECONDS
-from body_tracking.recording.rosbag2 import BagReader, TopicInfo, recover
+from body_tracking.recording.rosbag2 import BagError, BagReader, TopicInfo, recover
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,11 +138,26 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """``body_tracking bag info`` and ``body_tracking bag recover``."""
-    if args.verb == "recover":
-        recover(args.bag).close()
+    before = _recovered(args.bag) if args.verb == "recover" else None
     info = bag_info(args.bag)
     if args.json:
-        print(json.dumps(asdict(info) | {"path": str(info.path)}, indent=2))
-    else:
-        _print(info)
+        content = asdict(info) | {"path": str(info.path)}
+        print(json.dumps(content if before is None else content | {"before": before}, indent=2))
+        return 0
+    for line in before or ():
+        print(f"before    {line}")
+    if before == []:
+        print("before    nothing was missing: the bag is left as it was")
+    _print(info)
     return 0
+
+
+def _recovered(folder: Path) -> list[str]:
+    """Close a bag, and return what was missing in it; a bag of which nothing is missing is left as it is."""
+    try:
+        before = bag_info(folder).warnings
+    except BagError as error:
+        before = [str(error)]
+    if before or not folder.is_dir():  # which recover refuses
+        recover(folder).close()
+    return before

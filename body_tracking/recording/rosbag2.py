@@ -566,7 +566,8 @@ def recover(folder: Path | str) -> BagReader:
     folder = Path(folder)
     paths = _files(folder)
     if not paths:
-        raise BagError(f"{folder}: no mcap file is in the folder")
+        reason = "no mcap file is in the folder" if folder.is_dir() else "no such folder"
+        raise BagError(f"{folder}: {'not a folder' if folder.is_file() else reason}")
     try:
         for path in paths:
             _refuse_if_in_use(path)

@@ -170,6 +170,21 @@ def test_a_truncated_recording_is_reported_and_closed(tmp_path, capsys):
     assert 0 < count < 1000
     code, out, err = run(capsys, "bag", "recover", tmp_path / "bag", "--json")
     assert code == 0 and json.loads(out)["messages"] == count and json.loads(out)["warnings"] == []
+    assert any("cut off" in line for line in json.loads(out)["before"])
+
+
+def test_recovering_says_what_was_missing_and_leaves_a_whole_bag_as_it_is(tmp_path, capsys):
+    import_files([frames(tmp_path / "a.csv", 0, 1)], tmp_path / "bag")
+    metadata = tmp_path / "bag" / "metadata.yaml"
+    metadata.unlink()
+    code, out, err = run(capsys, "bag", "recover", tmp_path / "bag")
+    assert code == 0 and err == "" and "before    " in out and "metadata.yaml is missing" in out
+    metadata.write_text(written := f"{metadata.read_text()}  custom_data: null\n")
+    code, out, err = run(capsys, "bag", "recover", tmp_path / "bag")
+    assert code == 0 and err == "" and out.startswith("before    nothing was missing")
+    assert metadata.read_text() == written
+    code, out, err = run(capsys, "bag", "recover", tmp_path / "bag", "--json")
+    assert code == 0 and err == "" and json.loads(out)["before"] == []
 
 
 @pytest.mark.parametrize(
@@ -186,6 +201,8 @@ def test_a_truncated_recording_is_reported_and_closed(tmp_path, capsys):
         (["bag", "info", "absent"], "no such recording"),
         (["bag", "info", "a.txt"], "not an mcap file"),
         (["bag", "recover", "taken"], "no mcap file"),
+        (["bag", "recover", "absent"], "absent: no such folder"),
+        (["bag", "recover", "a.txt"], "a.txt: not a folder"),
     ],
 )
 def test_errors_are_one_line(tmp_path, monkeypatch, capsys, arguments, text):
