@@ -205,7 +205,7 @@ def nodes_for(options: Options) -> tuple[NodeSpec, ...]:
     """
     specs = [spec for system in SYSTEMS for spec in system.specs(options)]
     if not any(NODES[spec.executable].place < Place.CONSUMER and not is_player(spec) for spec in specs):
-        raise graph.GraphError("no sensors")
+        raise graph.GraphError("no sensors: name some that give skeletons, images, markers or inertial readings")
     specs.sort(key=lambda spec: -NODES[spec.executable].place)
     viewed = asked(options, **{view.option: view.option for view in VIEWS})
     return tuple(

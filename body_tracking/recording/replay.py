@@ -247,12 +247,14 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
             raise
         progress.end()
         counters = Counter(runner.counters)
-        if not written.frames:
-            given = ", ".join(settings.sensors or sources)
-            raise ReplayError(f"{bag_path}: no frame of {given} came through ({_listed(counters)})")
         for stage in stages:
             counters.update({f"{stage.NAME} {name}": count for name, count in stage.counters.items()})
         counters |= Counter(written.counters)  # both halves may have counted the same message
+        if not written.frames:
+            given = ", ".join(settings.sensors or sources)
+            states = [stage.state(bag.end_ns) for stage in stages]
+            said = "; ".join(text for level, text, _ in states if level and text) or _listed(+counters)
+            raise ReplayError(f"{bag_path}: no frame of {given} came through ({said})")
         return ReplayReport(
             written.frames,
             (bag.end_ns - bag.start_ns) / NANOSECONDS,

@@ -37,6 +37,7 @@ from body_tracking.pipeline import graph
 from body_tracking.pipeline.offline import OfflineRunner
 from body_tracking.recording import forked
 from body_tracking.recording.forked import Downstream, ForkedDownstream
+from body_tracking.recording.importer import import_files
 from body_tracking.recording.replay import ReplayError, ReplaySettings, replay
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BagError, BagReader, BagWriter, RawMessage, deserialize
@@ -496,6 +497,20 @@ def test_sensors_none_leaves_out_the_skeletons_of_a_bag(tmp_path: Path, command:
     ):
         code, _, reported = command("replay", BAG, "-o", tmp_path / "out", "--sensors", "none", *more)
         assert code == 2 and message in reported
+    assert not (tmp_path / "out").exists()
+
+
+def test_inertial_sensors_without_a_pose_are_named(tmp_path: Path, command: Command) -> None:
+    """What a stage says of itself is the reason, not the counters of what it left out."""
+    readings = "".join(f"{k / 50},{k % 7},0.3,0.1,0,0,9.81\n" for k in range(200))
+    header = "stamp,angular_velocity_x,angular_velocity_y,angular_velocity_z"
+    (tmp_path / "a.csv").write_text(
+        f"{header},linear_acceleration_x,linear_acceleration_y,linear_acceleration_z\n{readings}"
+    )
+    import_files([tmp_path / "a.csv"], tmp_path / "bag", sensors={tmp_path / "a.csv": "forearm_left"})
+    words = ("replay", tmp_path / "bag", "-o", tmp_path / "out", "--sensors", "none", "--imus", "forearm_left")
+    code, _, reported = command(*words)
+    assert code == 2 and reported.count("\n") == 1 and "(forearm_left: not aligned)" in reported
     assert not (tmp_path / "out").exists()
 
 
