@@ -42,6 +42,7 @@ class C3dPoints:
         up: the axis that points up (POINT:Y_SCREEN), such as ``+Z``; empty where the file does not say.
         rate: frames per second.
         stamps: (n,) seconds.
+        cut: how the file is truncated; empty where it is whole.
         computed: labels of points that are angles, forces, moments, powers or scalars.
         processing: the numbers in the group PROCESSING.
     """
@@ -52,6 +53,7 @@ class C3dPoints:
     up: str
     rate: float
     stamps: FloatArray
+    cut: str
     computed: frozenset[str]
     processing: dict[str, float]
 
@@ -71,7 +73,7 @@ class Trial:
 
 
 def read_points(path: Path) -> C3dPoints:
-    """All points of a C3D file.
+    """All points of a C3D file, also of one that is cut off after its parameters.
 
     Raises:
         MarkerError: the file cannot be read, has no points, or an unknown unit of length.
@@ -106,8 +108,6 @@ def read_points(path: Path) -> C3dPoints:
     labels = all_of("LABELS")[: data.shape[1]]
     if not data.size:
         raise MarkerError(f"{path}: {data.shape[1]} points in {len(data)} frames: there are no trajectories in it")
-    if len(data) < frames:
-        raise MarkerError(f"{path}: cut off after {len(data)} of {frames} frames")
     rate = float(value("POINT", "RATE", header["frame_rate"]))
     unit = value("POINT", "UNITS", "mm").strip()
     if not rate > 0.0:
@@ -123,6 +123,7 @@ def read_points(path: Path) -> C3dPoints:
         str(value("POINT", "Y_SCREEN", "")).strip().upper(),
         rate,
         (int(header["first_frame"]) + np.arange(len(data))) / rate,
+        f"cut off after {len(data)} of {frames} frames" if len(data) < frames else "",
         frozenset(label for name in _COMPUTED for label in all_of(name)),
         {name: float(number) for name, number in numbers.items() if isinstance(number, int | float | np.number)},
     )
@@ -140,6 +141,8 @@ def read_trial(path: Path, subject: str | None, wanted: Collection[str]) -> Tria
         MarkerError: the file cannot be read, or lacks the subject.
     """
     file = read_points(path)
+    if file.cut:
+        raise MarkerError(f"{path}: {file.cut}")
     if not file.labels:
         raise MarkerError(f"{path}: no point has a label")
     up = file.up or "+Z"

@@ -116,6 +116,8 @@ class CsvRecording:
     def _checked_names(self, header: list[str]) -> list[str]:
         """The names of the columns."""
         names = [name.strip() for name in header]
+        if len(names) == 1 and (separator := next((each for each in ";\t" if each in names[0]), None)):
+            raise self._file.error(1, f"cells are separated by {separator!r}, expected ','")
         twice = next((name for name, count in Counter(names).items() if count > 1), None)
         if twice is not None:
             raise self._file.error(1, f"column {twice!r} is there twice")
@@ -202,4 +204,4 @@ def _listing(what: str, names: Sequence[str]) -> str:
     if not names:
         return ""
     more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-    return f"{what}{'s' if len(names) > 1 else ''} {', '.join(names[:5])}{more}"
+    return f"{what}{'s' if len(names) > 1 else ''} {', '.join(name[:40] for name in names[:5])}{more}"

@@ -136,7 +136,7 @@ class NtuRecording:
         except ValueError:
             number = -1
         if number < 0:
-            raise self._error(f"{what}: {text.strip()!r}, expected a whole number")
+            raise self._error(f"{what}: {text.strip()[:40]!r}, expected a whole number")
         return number
 
     def _body(self, stamp_ns: int, numbers: dict[str, int], counts: Counter[str]) -> Skeleton:

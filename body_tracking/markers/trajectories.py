@@ -88,7 +88,7 @@ def read_trajectories(path: Path, partial: bool = False) -> Trajectories:
 
     Args:
         path: a file for which :func:`is_trajectory_file` holds.
-        partial: read a truncated export of Motive up to its last whole row.
+        partial: read a truncated file up to its last whole frame.
 
     Raises:
         BodyTrackingError: the file cannot be read, or has no points.
@@ -98,7 +98,9 @@ def read_trajectories(path: Path, partial: bool = False) -> Trajectories:
         # Motive's y points up
         return Trajectories(motive.labels, motive.positions[..., c3d.UP_FIRST["+Y"]], motive.stamps_ns, motive.warnings)
     file = c3d.read_points(path)
-    warnings = []
+    if file.cut and not partial:
+        raise TrajectoryError(f"{path}: {file.cut} (--partial reads these)")
+    warnings = [f"{path}: {file.cut}"] if file.cut else []
     if file.up not in c3d.UP_FIRST:
         said = f"says that {file.up} points up" if file.up else "does not say which axis points up"
         warnings.append(f"{path}: {said} (POINT:Y_SCREEN); its axes are kept")
@@ -132,7 +134,7 @@ class TrajectoryRecording:
         path: a file for which :func:`is_trajectory_file` holds.
         labels: of the points that are read; all, also those without a label, when empty.
         noise: standard deviation of each coordinate, metres.
-        partial: read a truncated export of Motive up to its last whole row.
+        partial: read a truncated file up to its last whole frame.
 
     Attributes:
         problems: counts of irregularities, by kind.

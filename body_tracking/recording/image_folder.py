@@ -37,7 +37,7 @@ from body_tracking.messages.cameras import CAMERA_INFO
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagWriter
 
-_COLOUR: Final = ("rgb", "color", "colour")
+COLOUR_FOLDERS: Final = ("rgb", "color", "colour")
 _SUFFIXES: Final = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
 _MILLIMETRES: Final = 1000.0
 _LARGEST: Final = 64 << 20
@@ -50,7 +50,7 @@ class ImageFolderError(BodyTrackingError):
 
 def is_image_folder(path: Path) -> bool:
     """Whether a path is a folder with a folder of colour images."""
-    return any((path / name).is_dir() for name in _COLOUR)
+    return any((path / name).is_dir() for name in COLOUR_FOLDERS)
 
 
 def import_folder(
@@ -75,9 +75,9 @@ def import_folder(
         BagError: the bag cannot be written.
     """
     names, frame = DRIVERS["plain"].of(check_sensor_name(camera)), optical_frame(camera)
-    colour_folder = next((folder / name for name in _COLOUR if (folder / name).is_dir()), None)
+    colour_folder = next((folder / name for name in COLOUR_FOLDERS if (folder / name).is_dir()), None)
     if colour_folder is None:
-        raise ImageFolderError(f"{folder}: no folder {' or '.join(_COLOUR)}")
+        raise ImageFolderError(f"{folder}: no folder {' or '.join(COLOUR_FOLDERS)}")
     if not (np.isfinite(rate) and rate > 0.0 and np.isfinite(depth_scale) and depth_scale > 0.0):
         raise ImageFolderError(f"rate {rate} and depth scale {depth_scale}: expected positive numbers")
     colour, depth = _stamped(colour_folder, rate), _stamped(folder / "depth", rate)

@@ -34,6 +34,7 @@ from body_tracking.kinect.ntu import NtuRecording
 from body_tracking.markers import setup
 from body_tracking.markers.messages import points_to_cloud
 from body_tracking.markers.trajectories import (
+    C3D_SUFFIX,
     DEFAULT_NOISE,
     FRAME,
     RecordedPoints,
@@ -42,7 +43,7 @@ from body_tracking.markers.trajectories import (
     labels_in,
     points_of,
 )
-from body_tracking.mesh.ntu_mocap import NtuMocapRecording, RecordedDepth, RecordedMarkers, is_ntu_mocap
+from body_tracking.mesh.ntu_mocap import DEPTH_FILE, NtuMocapRecording, RecordedDepth, RecordedMarkers, is_ntu_mocap
 from body_tracking.mesh.topics import IMAGES, body_index_topic, depth_topic, info_topic
 from body_tracking.messages.angles import angles_to_joint_states
 from body_tracking.messages.cameras import CAMERA_INFO, camera_to_info
@@ -50,13 +51,15 @@ from body_tracking.messages.images import array_to_image
 from body_tracking.messages.imus import sample_to_messages
 from body_tracking.messages.skeletons import skeletons_to_cloud
 from body_tracking.pipeline.graph import DEFAULT_BODY, TRUE_ANGLES
-from body_tracking.recording.image_folder import import_folder, is_image_folder
+from body_tracking.recording.image_folder import COLOUR_FOLDERS, import_folder, is_image_folder
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter
 
 CSV_SUFFIXES = (".csv", ".csv.gz")
 NTU_SUFFIX = ".skeleton"
 MVNX_SUFFIXES = (".mvnx", ".mvnx.gz")
+BAG_SUFFIX = ".mcap"
+SUFFIXES = (*CSV_SUFFIXES, NTU_SUFFIX, *MVNX_SUFFIXES, C3D_SUFFIX)
 
 _Item = RecordedFrame | RecordedImu | RecordedAngles | RecordedPoints | RecordedDepth | RecordedMarkers
 _Recording = Recording[_Item]
@@ -147,18 +150,37 @@ def _open_any(path: Path, name: str | None, partial: bool, labels: Sequence[str]
     """The reader for a file of skeletons, of inertial readings or of points, or for a folder with all of them."""
     if is_ntu_mocap(path):
         return NtuMocapRecording(path, name, partial)
-    if path.is_file():
-        if is_trajectory_file(path):
-            if name is not None:
-                raise ImportFileError(f"--sensor {name}={path}: its points are of no sensor")
-            return TrajectoryRecording(path, labels, noise, partial)
-        if path.name.lower().endswith(MVNX_SUFFIXES):
-            if name is not None:
-                raise ImportFileError(f"--sensor {name}={path}: an MVNX file names its sensors itself")
-            return MvnxRecording(path, partial)
-        if _is_inertial(path):
-            return ImuCsvRecording(path, None if name is None else name.split(","), partial)
+    _check_kind(path)
+    if is_trajectory_file(path):
+        if name is not None:
+            raise ImportFileError(f"--sensor {name}={path}: its points are of no sensor")
+        return TrajectoryRecording(path, labels, noise, partial)
+    if path.name.lower().endswith(MVNX_SUFFIXES):
+        if name is not None:
+            raise ImportFileError(f"--sensor {name}={path}: an MVNX file names its sensors itself")
+        return MvnxRecording(path, partial)
+    if _is_inertial(path):
+        return ImuCsvRecording(path, None if name is None else name.split(","), partial)
     return open_recording(path, name, partial)
+
+
+def _check_kind(path: Path) -> None:
+    """Raise where a path is nothing that can be imported, by its name and kind."""
+    if path.suffix == BAG_SUFFIX or (path.is_dir() and any(path.glob(f"*{BAG_SUFFIX}"))):
+        raise ImportFileError(f"{path}: a bag, which needs no import")
+    if path.is_dir():
+        *first, last = (f"{name}/" for name in COLOUR_FOLDERS)
+        raise ImportFileError(
+            f"{path}: a folder without images in {', '.join(first)} or {last} and without {DEPTH_FILE}"
+        )
+    if not path.exists():
+        raise ImportFileError(f"{path}: no such file")
+    if not path.is_file():
+        raise ImportFileError(f"{path}: not a file")
+    if not path.name.lower().endswith(SUFFIXES):
+        raise ImportFileError(f"{path}: not a {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]} file")
+    if not path.stat().st_size:
+        raise ImportFileError(f"{path}: the file is empty")
 
 
 def _is_inertial(path: Path) -> bool:

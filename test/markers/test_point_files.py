@@ -123,6 +123,17 @@ def test_a_truncated_export_is_read_only_with_partial(tmp_path: Path) -> None:
     assert len(read_trajectories(path, partial=True).positions) == 4
 
 
+def test_a_truncated_c3d_file_is_read_only_with_partial(tmp_path: Path) -> None:
+    path = write_c3d(tmp_path / "take.c3d", moving(), ["a", "b", "c"])
+    whole = read_trajectories(path).positions
+    path.write_bytes(path.read_bytes()[: -path.stat().st_size % 512 - 512 + 3 * 48])  # ends in a block of 512 bytes
+    with pytest.raises(TrajectoryError, match=r"take\.c3d: cut off after 3 of 5 frames \(--partial reads these\)"):
+        read_trajectories(path)
+    found = read_trajectories(path, partial=True)
+    np.testing.assert_array_equal(found.positions, whole[:3])
+    assert any("cut off after 3 of 5 frames" in line for line in found.warnings)
+
+
 def test_points_without_labels_and_chosen_labels(tmp_path: Path) -> None:
     unlabelled = write_c3d(tmp_path / "a.c3d", moving(), ["", "", ""])
     found = [frame.points for frame in TrajectoryRecording(unlabelled)]

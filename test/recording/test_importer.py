@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import gzip
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -191,7 +192,13 @@ def test_recovering_says_what_was_missing_and_leaves_a_whole_bag_as_it_is(tmp_pa
     ("arguments", "text"),
     [
         (["import", "absent.csv", "-o", "bag"], "no such file"),
-        (["import", "a.txt", "-o", "bag"], "not a .csv"),
+        (["import", "a.txt", "-o", "bag"], "a.txt: not a .csv, .csv.gz, .skeleton, .mvnx, .mvnx.gz or .c3d file"),
+        (["import", "empty.mvnx", "-o", "bag"], "empty.mvnx: the file is empty"),
+        (["import", "taken", "-o", "bag"], "taken: a folder without images in rgb/, color/ or colour/"),
+        (["import", "folder.csv", "-o", "bag"], "folder.csv: a folder without images"),
+        (["import", "pipe.csv", "-o", "bag"], "pipe.csv: not a file"),
+        (["import", "made", "-o", "bag"], "made: a bag, which needs no import"),
+        (["import", "made/made_0.mcap", "-o", "bag"], "made_0.mcap: a bag, which needs no import"),
         (["import", "a.csv", "b.csv", "-o", "bag", "--sensor", "left"], "of which"),
         (["import", "a.csv", "-o", "bag", "--sensor", "left=c.csv"], "no such file is imported"),
         (["import", "a.csv", "-o", "bag", "--sensor", "l/r"], "letters"),
@@ -212,6 +219,10 @@ def test_errors_are_one_line(tmp_path, monkeypatch, capsys, arguments, text):
     (tmp_path / "a.txt").write_text("no recording")
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "precious.txt").touch()
+    (tmp_path / "empty.mvnx").touch()
+    (tmp_path / "folder.csv").mkdir()
+    os.mkfifo(tmp_path / "pipe.csv")
+    import_files([tmp_path / "a.csv"], tmp_path / "made")
     code, out, err = run(capsys, *arguments)
     assert code == 2 and text in err and len(err.strip().splitlines()) == 1 and out == ""
     assert (tmp_path / "taken" / "precious.txt").exists() and not (tmp_path / "bag").exists()
