@@ -13,8 +13,9 @@ of the TU Munich); other files are numbered through at a given rate. Files go in
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any, Final
@@ -38,14 +39,45 @@ from body_tracking.recording.progress import Progress
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagWriter
 
 COLOUR_FOLDERS: Final = ("rgb", "color", "colour")
-_SUFFIXES: Final = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
+_SUFFIXES: Final = (".png", ".jpg", ".jpeg")
+_MARKS: Final = {"png": (b"\x89PNG\r\n\x1a\n", b"IEND"), "jpeg": (b"\xff\xd8", b"\xff\xd9")}
+"""How the data of an image begin, and what is near their end."""
 _MILLIMETRES: Final = 1000.0
+_TAIL: Final = 4096
+"""Bytes: some cameras append their own after an image."""
 _LARGEST: Final = 64 << 20
 """Bytes of an image file."""
 
 
 class ImageFolderError(BodyTrackingError):
     """The folder has no images, no intrinsics, or a file of it cannot be used; the text names it."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImportedImages:
+    """What was written.
+
+    Attributes:
+        bag: the folder.
+        camera: the sensor's name.
+        colour, depth: numbers of images.
+        recording_s: seconds from the first image to the last.
+    """
+
+    bag: Path
+    camera: str
+    colour: int
+    depth: int
+    recording_s: float
+
+    def text(self) -> str:
+        """One line."""
+        images = f"{self.colour} colour and {self.depth} depth images of {self.camera}"
+        return f"{self.bag}: {images}, {self.recording_s:.1f} s"
+
+    def as_json(self) -> str:
+        """One JSON object."""
+        return json.dumps(asdict(self) | {"bag": str(self.bag)}, indent=2)
 
 
 def is_image_folder(path: Path) -> bool:
@@ -55,7 +87,7 @@ def is_image_folder(path: Path) -> bool:
 
 def import_folder(
     folder: Path, bag_folder: Path, camera: str, rate: float, depth_scale: float, *, overwrite: bool = False
-) -> str:
+) -> ImportedImages:
     """Write the images of a folder as a bag.
 
     Args:
@@ -65,9 +97,6 @@ def import_folder(
         rate: images a second, where the files' names are no stamps.
         depth_scale: of a depth image's numbers to a metre.
         overwrite: replace a bag that is there.
-
-    Returns:
-        What was written, in one line.
 
     Raises:
         ImageFolderError: see there; no bag is left then.
@@ -102,9 +131,9 @@ def import_folder(
         for topic, each in infos.items():
             bag.write(topic, DepthInfo().encode((first_ns, each), BAG_WIRE), first_ns)
         for number, (stamp_ns, topic, path) in enumerate(images):
-            data, form = _data(path), _SUFFIXES[path.suffix.lower()]
+            data = _data(path)
             if topic.endswith(COMPRESSED):
-                cdr = CompressedColour.packed(data, stamp_ns, frame, form, BAG_WIRE)
+                cdr = CompressedColour.packed(data, stamp_ns, frame, _form(path, data), BAG_WIRE)
             else:
                 cdr = CompressedDepth().encode((stamp_ns, frame, _depth(path, data, depth_scale)), BAG_WIRE)
             bag.write(topic, cdr, stamp_ns)
@@ -114,8 +143,7 @@ def import_folder(
         raise
     bag.close()
     progress.end()
-    seconds = (images[-1][0] - first_ns) / NANOSECONDS
-    return f"{bag_folder}: {len(colour)} colour and {len(depth)} depth images of {camera}, {seconds:.1f} s"
+    return ImportedImages(bag_folder, camera, len(colour), len(depth), (images[-1][0] - first_ns) / NANOSECONDS)
 
 
 def _stamped(folder: Path, rate: float) -> dict[int, Path]:
@@ -147,6 +175,8 @@ def _stamp(stem: str) -> int | None:
 def _read_info(path: Path, frame: str) -> Camera:
     try:
         content = files.read_yaml(path, aliases=False)
+        if not isinstance(content, Mapping):
+            raise ValueError("no intrinsics as ROS's camera_calibration writes them")
         model = str(content.get("distortion_model") or "plumb_bob")
         given = _numbers(content, "distortion_coefficients") if "distortion_coefficients" in content else np.zeros(0)
         distortion = np.zeros(MODELS.get(model, len(given)))
@@ -165,6 +195,8 @@ def _read_info(path: Path, frame: str) -> Camera:
 
 
 def _numbers(content: Mapping[str, Any], key: str) -> Any:
+    if not (isinstance(content[key], Mapping) and "data" in content[key]):
+        raise ValueError(f"{key}: expected rows, cols and data")
     return np.asarray(content[key]["data"], dtype=np.float64).ravel()
 
 
@@ -191,8 +223,19 @@ def _data(path: Path) -> bytes:
         raise ImageFolderError(f"{path}: {error}") from error
 
 
+def _form(path: Path, data: bytes) -> str:
+    """The format of a whole image, by its data: a name may have the suffix of the other one."""
+    form = next((each for each, (begin, _) in _MARKS.items() if data.startswith(begin)), None)
+    if form is None:
+        raise ImageFolderError(f"{path}: {'no PNG or JPEG image' if data else 'the file is empty'}")
+    if _MARKS[form][1] not in data[-_TAIL:]:
+        raise ImageFolderError(f"{path}: cut off after {len(data)} bytes")
+    return form
+
+
 def _decoded(path: Path, data: bytes) -> Any:
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    _form(path, data)  # of what is cut off, OpenCV would write a line of its own
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 2:
         raise ImageFolderError(f"{path}: no PNG image of 16 bits and one channel")
     return pixels

@@ -404,7 +404,8 @@ def run(args: argparse.Namespace) -> int:
             raise ImportFileError(f"{args.files[0]}: a folder of images is imported alone")
         camera = _parse_sensors(args.sensor, args.files).get(args.files[0], "camera1")
         given = args.files[0], args.output, camera, args.rate, args.depth_scale
-        print(import_folder(*given, overwrite=args.overwrite))
+        images = import_folder(*given, overwrite=args.overwrite)
+        print(images.as_json() if args.json else images.text())
         return 0
     report = import_files(
         args.files,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -98,6 +99,38 @@ def _colour_as_depth(images: Path) -> None:
     assert cv2.imwrite(str(first), np.zeros((4, 4, 3), np.uint8))
 
 
+def _cut_depth(images: Path) -> None:
+    last = sorted((images / "depth").iterdir())[-1]
+    last.write_bytes(last.read_bytes()[:-20])
+
+
+def _cut_colour(images: Path) -> None:
+    last = sorted((images / "rgb").iterdir())[-1]
+    last.write_bytes(last.read_bytes()[:-20])
+
+
+def _cut_jpeg(images: Path) -> None:
+    last = sorted((images / "rgb").iterdir())[-1].rename(images / "rgb" / "2.5.jpg")
+    last.write_bytes(cv2.imencode(".jpg", np.zeros((48, 64, 3), np.uint8))[1].tobytes()[:-20])
+
+
+def _empty_colour(images: Path) -> None:
+    sorted((images / "rgb").iterdir())[-1].write_bytes(b"")
+
+
+def _text_as_colour(images: Path) -> None:
+    sorted((images / "rgb").iterdir())[-1].write_text("no image")
+
+
+def _list_as_info(images: Path) -> None:
+    (images / "camera_info.yaml").write_text("- 1\n")
+
+
+def _list_as_matrix(images: Path) -> None:
+    info = yaml.safe_load((images / "camera_info.yaml").read_text())
+    (images / "camera_info.yaml").write_text(yaml.safe_dump(info | {"camera_matrix": [1.0] * 9}))
+
+
 def _nothing(images: Path) -> None:
     for path in (images / "rgb").iterdir():
         path.unlink()
@@ -112,12 +145,30 @@ def _nothing(images: Path) -> None:
         (_no_yaml, "camera_info.yaml"),
         (_colour_as_depth, "no PNG image of 16 bits"),
         (_nothing, "no PNG or JPEG images"),
+        (_cut_depth, r"depth/1305031102\.243211\.png: cut off after \d+ bytes"),
+        (_cut_colour, r"rgb/1305031102\.243211\.png: cut off after \d+ bytes"),
+        (_cut_jpeg, r"rgb/2\.5\.jpg: cut off after \d+ bytes"),
+        (_empty_colour, r"243211\.png: the file is empty"),
+        (_text_as_colour, r"243211\.png: no PNG or JPEG image"),
+        (_list_as_info, "camera_info.yaml: no intrinsics as ROS's camera_calibration writes them"),
+        (_list_as_matrix, "camera_info.yaml: camera_matrix: expected rows, cols and data"),
     ],
 )
-def test_a_folder_that_cannot_be_used_is_named_and_leaves_no_bag(tmp_path: Path, spoil: object, reason: str) -> None:
+def test_a_folder_that_cannot_be_used_is_named_and_leaves_no_bag(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], spoil: object, reason: str
+) -> None:
     images = folder(tmp_path / "images")
     assert callable(spoil)
     spoil(images)
     with pytest.raises(BodyTrackingError, match=reason):
         import_folder(images, tmp_path / "bag", "camera1", 30.0, 1000.0)
     assert not (tmp_path / "bag").exists()
+    assert capfd.readouterr().err == ""  # of OpenCV
+
+
+def test_json_tells_what_was_imported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    images, bag = folder(tmp_path / "images"), tmp_path / "bag"
+    assert cli.main(["import", str(images), "-o", str(bag), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found.pop("recording_s") == pytest.approx(0.068, abs=1e-3)
+    assert found == {"bag": str(bag), "camera": "camera1", "colour": 3, "depth": 3}
