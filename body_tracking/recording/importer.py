@@ -224,6 +224,9 @@ def import_files(
         _open_any(path, name, partial, labels, noise)
         for path, name in zip(files, _names(files, sensors or {}), strict=True)
     ]
+    if labels and not any(isinstance(each, TrajectoryRecording) for each in recordings):
+        given = ", ".join(map(str, files))
+        raise ImportFileError(f"{given}: no points of a motion capture system, of which --labels would choose")
     found: dict[str, ImportedSensor] = {}
     owners: dict[str, Path] = {}
     # Read all files before an existing bag is replaced: an invalid file must not destroy it.

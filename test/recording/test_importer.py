@@ -193,6 +193,7 @@ def test_recovering_says_what_was_missing_and_leaves_a_whole_bag_as_it_is(tmp_pa
     [
         (["import", "absent.csv", "-o", "bag"], "no such file"),
         (["import", "a.txt", "-o", "bag"], "a.txt: not a .csv, .csv.gz, .skeleton, .mvnx, .mvnx.gz or .c3d file"),
+        (["import", "a.csv", "-o", "bag", "--labels", "A"], "a.csv: no points of a motion capture system"),
         (["import", "empty.mvnx", "-o", "bag"], "empty.mvnx: the file is empty"),
         (["import", "taken", "-o", "bag"], "taken: a folder without images in rgb/, color/ or colour/"),
         (["import", "folder.csv", "-o", "bag"], "folder.csv: a folder without images"),
