@@ -30,8 +30,9 @@ _VIEW = np.radians(25.0)
 """Angle of the view from the person's front, so that depth is visible."""
 
 
-def _legend(dashed: str = ", truth dashed") -> str:
-    return f"left blue, right orange, band 1.96 standard deviations{dashed}; no line where the angle is unknown"
+def _legend(names: Iterable[str], dashed: str = ", truth dashed") -> str:
+    sides = "left blue, right orange, " if any(map(_side, names)) else ""
+    return f"{sides}band 1.96 standard deviations{dashed}; no line where the angle is unknown"
 
 
 def draw(tracked: Tracked, path: Path) -> None:
@@ -48,7 +49,7 @@ def draw(tracked: Tracked, path: Path) -> None:
     heights = [3.6] * bool(tracked.skeletons) + [_height(each.names) for each in shown]
     figure = figure_of(0.3 + sum(heights))
     parts = figure.subfigures(len(heights), 1, height_ratios=heights) if len(heights) > 1 else (figure,)
-    legend = _legend() if np.isfinite(true).any() else _legend("")
+    legend = _legend(angles.names) if np.isfinite(true).any() else _legend(angles.names, "")
     figure.suptitle(f"{tracked.bag.name}: {len(known)} frames, {tracked.duration:.1f} s; {legend}", fontsize=11)
     if tracked.skeletons:
         _draw_person(parts[0], tracked, start_ns)
@@ -69,7 +70,7 @@ def pictures(result: Evaluation) -> list[tuple[str, str]]:
     angles = first.named if first.named is not None and not named_are_positional(result) else first.positional
     drawn = [
         (f"Distance of each joint from the truth, mm, {first.name}; white: not known in both", _errors(result)),
-        (f"Angles, degrees, {first.name}; {_legend()}", _angle_picture(angles)),
+        (f"Angles, degrees, {first.name}; {_legend(angles.names)}", _angle_picture(angles)),
     ]
     if result.calibration:
         drawn.append(("Calibration over time against the true one", _calibration(result)))
@@ -78,7 +79,7 @@ def pictures(result: Evaluation) -> list[tuple[str, str]]:
 
 def reference_pictures(angles: AngleComparison) -> list[tuple[str, str]]:
     """The same of an evaluation by the marker system, given its angles."""
-    return [(f"Angles, degrees; {_legend()}", _angle_picture(angles))] if angles.names else []
+    return [(f"Angles, degrees; {_legend(angles.names)}", _angle_picture(angles))] if angles.names else []
 
 
 def _angle_picture(angles: AngleComparison) -> str:
@@ -156,6 +157,9 @@ def _draw_angles(figure: Any, angles: AngleComparison, still: float = _STILL) ->
             low, high = curve - band[:, column], curve + band[:, column]
             axis.fill_between(times, low, high, color=colour, alpha=0.18, linewidth=0.0)
             axis.plot(times, curve, color=colour, linewidth=1.3)
+            # between unknown ones an angle has no line, but a place on the axis
+            around = np.pad(np.isfinite(curve), 1)
+            axis.plot(*np.array([times, curve])[:, around[1:-1] & ~around[:-2] & ~around[2:]], ".", color=colour)
             axis.plot(times, _unbroken(true[:, column]), "--", color="black", linewidth=0.8)
         edge = np.nan_to_num(np.minimum(band[:, columns], 30.0))  # wider ones would leave the curves flat
         edges = np.concatenate([found[:, columns] - edge, found[:, columns] + edge, true[:, columns]])
@@ -163,6 +167,8 @@ def _draw_angles(figure: Any, angles: AngleComparison, still: float = _STILL) ->
         margin = max(0.05 * (most - least), 0.5 * (still - (most - least)))
         axis.set_ylim(least - margin, most + margin)
         _label(axis, title)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("deg", fontsize=8)
     for axis in axes.flat[len(panels) :]:
         axis.set_visible(False)
 

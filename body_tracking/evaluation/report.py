@@ -73,7 +73,8 @@ class Table:
         titles = [self.title, *(column.title for column in self.columns)]
         rows = [titles, ["", *(column.unit for column in self.columns)]]
         rows += [[name, *(column.text(row) for column in self.columns)] for row, name in enumerate(self.names)]
-        first, *widths = max(len(row[0]) for row in rows), *(max(len(each), 6) for each in titles[1:])
+        first, *widths = (max(map(len, cells)) for cells in zip(*rows, strict=True))
+        widths = [max(each, 6) for each in widths]
         header, units, *others = (
             " ".join([f"{name:<{first}}", *(f"{cell:>{width}}" for cell, width in zip(cells, widths, strict=True))])
             for name, *cells in rows

@@ -42,9 +42,10 @@ def summary(angles: AngleSeries, truth: AngleSeries | None = None) -> Table:
         ]
     if are_fine(angles):
         columns = [each._replace(digits=3) if each.unit == "deg" else each for each in columns]
-    note = "stddev: median. known: share of the frames with a finite angle, however large its stddev."
+    note = "stddev: median" + (", inf if unknown in most frames" if np.isinf(columns[3].values).any() else "")
+    note += ". known: share of the frames with a finite angle, however large its stddev."
     if np.isfinite(error).any():
-        note += "\ntrue min to max err: of frames with a truth. in 2 sd: errors within two stddev; 95 % is ideal."
+        note += "\nFrom true min on: of frames with a truth. in 2 sd: errors within two stddev; 95 % is ideal."
     return Table("angles", "angle", angles.names, tuple(columns), note)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from body_tracking.cli import main
 from body_tracking.core.message_types import JOINT_STATE, POINT_CLOUD
 from body_tracking.core.skeleton import N_JOINTS, FloatArray, Skeleton, TrackingState
 from body_tracking.evaluation import pictures
+from body_tracking.evaluation.comparison import AngleComparison
+from body_tracking.evaluation.metrics import angle_errors
 from body_tracking.evaluation.reading import AngleSeries, EvaluationError, Tracked, nearest, read
 from body_tracking.evaluation.show import summarise, summary
 from body_tracking.filters import make_filter
@@ -95,6 +98,47 @@ def test_the_note_explains_the_columns_that_are_there() -> None:
     angles = series([10.0, 20.0], [1.0, 40.0])
     assert "known:" in summary(angles).note and "in 2 sd:" not in summary(angles).note
     assert "in 2 sd:" in summary(angles, series([11.0, 20.0], [0.0, 0.0])).note
+
+
+def test_the_note_says_what_an_infinite_deviation_means() -> None:
+    assert "inf if unknown in most frames" in summary(series([10.0, 20.0], [np.inf, np.inf])).note
+    assert "inf" not in summary(series([10.0, 20.0], [1.0, 40.0])).note.replace("finite", "")
+
+
+def test_titles_stand_above_their_columns() -> None:
+    fine = summary(series([-123.4, -120.0], [0.001, 0.001]), series([-123.4, -120.0], [0.0, 0.0]))
+    titles, units, _, row = fine.text().splitlines()
+    ends = [match.end() for match in re.finditer(r"\S+", units)]
+    assert ends == [match.end() for match in re.finditer(r"\S+", row)][1:]
+    assert all(titles[:end].endswith(column.title) for column, end in zip(fine.columns, ends, strict=True))
+
+
+def test_a_picture_says_its_unit_and_names_sides_only_where_there_are_some(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Figure] = []
+    made = pictures.figure_of
+
+    def remembered(height: float) -> Figure:
+        drawn.append(made(height))
+        return drawn[-1]
+
+    monkeypatch.setattr(pictures, "figure_of", remembered)
+    for name, sides in (("knee", False), ("elbow_flexion_left", True)):
+        angles = series([10.0, 20.0, 30.0], [1.0, 1.0, 1.0], name)
+        pictures.draw(Tracked(Path("bag"), "body1", angles, (), None, ()), tmp_path / f"{name}.png")
+        assert ("left blue" in drawn[-1].get_suptitle()) == sides
+        assert drawn[-1].axes[0].get_ylabel() == "deg" and drawn[-1].axes[0].get_xlabel() == "s"
+
+
+def test_an_angle_known_for_one_frame_is_a_dot(tmp_path: Path) -> None:
+    """Without it an axis would reach to a value that is not drawn."""
+    lone, figure = series([np.nan, 90.0, np.nan, 10.0, 11.0], [1.0] * 5), Figure()
+    nothing = np.full((5, 1), np.nan)
+    errors = angle_errors(lone.known, nothing, lone.stddev)
+    pictures._draw_angles(figure, AngleComparison(("knee",), np.arange(5.0), lone.known, nothing, lone.stddev, errors))
+    (dots,) = (line for line in figure.axes[0].lines if line.get_marker() == ".")
+    assert dots.get_xydata().tolist() == [[1.0, pytest.approx(90.0)]]
 
 
 def test_a_truth_in_another_world_is_drawn_onto_the_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
