@@ -25,7 +25,7 @@ from domains import domain
 ROOT = Path(__file__).resolve().parent.parent
 SHARED_FOLDERS = ("config", "launch", "rviz", "foxglove", "bags")
 
-# import name -> (distribution, rosdep key); None where rosdistro has no key and README.md gives the pip line.
+# import name -> (distribution, rosdep key); None where rosdistro has no key that fits and README.md gives the pip line.
 # What is not here is a ROS package, declared under its own name.
 LIBRARIES = {
     "numpy": ("numpy", "python3-numpy"),
@@ -111,6 +111,15 @@ def test_version_is_the_same_everywhere(manifest: ElementTree.Element, wheel: Pa
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert version == citation["version"] == body_tracking.__version__
     assert date.date() == citation["date-released"]
+
+
+def test_the_maintainer_is_the_same_everywhere() -> None:
+    manifests = [ROOT / "package.xml", *(ROOT / "examples").rglob("package.xml")]
+    people = [each for path in manifests for each in ElementTree.parse(path).iter("maintainer")]
+    assert len(people) == len(manifests) > 1
+    ((name, _),) = {(each.text, each.get("email")) for each in people}
+    assert f'author="{name}"' in (ROOT / "setup.py").read_text()
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))["authors"] == [{"name": name}]
 
 
 def imports() -> Iterator[tuple[str, str]]:
