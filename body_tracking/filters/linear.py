@@ -167,8 +167,8 @@ class LinearKalmanParameters:
     )
     reacquire_after: float = number_field(
         0.12,
-        "a joint rejected for longer than this restarts at its measurement; much later the grown variance "
-        "would accept it as a sudden movement, and overshoot",
+        "a joint rejected for longer than this restarts at its measurement, and for about as long its deviation "
+        "includes the jump; much later the grown variance would accept it as a sudden movement, and overshoot",
         "s",
         0.0,
         60.0,
@@ -258,6 +258,7 @@ class LinearKalmanFilter(JointSmoother):
         self._kalman = StackedKalmanFilter(np.zeros((N_JOINTS, size, 1)), covariances)
         self._alive: BoolArray = np.zeros(N_JOINTS, dtype=bool)
         self._slow: FloatArray = np.zeros((N_JOINTS, 3, 3))
+        self._jumped: FloatArray = np.zeros((N_JOINTS, 3))
         self._level: FloatArray = np.zeros(N_JOINTS)
         self._unmeasured: FloatArray = np.zeros(N_JOINTS)
         self._rejected: FloatArray = np.zeros(N_JOINTS)
@@ -273,10 +274,10 @@ class LinearKalmanFilter(JointSmoother):
             skeleton: in a fixed frame, usually ``/fused/skeleton``.
 
         Returns:
-            The same body at the same stamp: position and covariance (position part of ``P`` and the slow part of the
-            noise); velocity (constant velocity) or NaN (the zero-velocity model has none); and the state: the
-            measurement's where it was used, INFERRED where the joint is predicted, NOT_TRACKED with NaN and an
-            infinite covariance where it is lost or was never seen. None for a repeated or late stamp, and where no
+            The same body at the same stamp: position and covariance (position part of ``P``, the slow part of the
+            noise, and the last jump); velocity (constant velocity) or NaN (the zero-velocity model has none); and the
+            state: the measurement's where it was used, INFERRED where the joint is predicted, NOT_TRACKED with NaN and
+            an infinite covariance where it is lost or was never seen. None for a repeated or late stamp, and where no
             joint is known.
         """
         arrival = self._arrivals.take(skeleton)
@@ -291,13 +292,18 @@ class LinearKalmanFilter(JointSmoother):
             self._centres.update(skeleton)
         positions, measured = self._measurement(skeleton)
         noise = self._measurement_noise(skeleton, positions, measured)
-        rejected = self._filter(positions, noise, measured & self._alive, step)
+        sudden, rejected = self._filter(positions, noise, measured & self._alive, step)
         self._update_ages(step, measured, rejected)
 
         started = measured & (~self._alive | (self._rejected > self.parameters.reacquire_after))
         if started.any():
             self._start(started, positions, noise)
             self.counters["reacquired"] += int((started & rejected).sum())
+        # after a jump either place may be wrong; the more frames confirm the new one, the less the old one counts
+        self._jumped *= np.exp(-step / max(self.parameters.reacquire_after, 1e-3))
+        jumped = sudden | started & rejected
+        if jumped.any():
+            self._jumped[jumped] = (self._kalman.x - self._kalman.x_prior)[jumped, :3, 0]
         self._started = started
         used = measured & (~rejected | started)
         slow = (1.0 - self.parameters.white_noise_share) * noise
@@ -336,8 +342,14 @@ class LinearKalmanFilter(JointSmoother):
         stddev = self.parameters.measurement_noise_scale * BASE_STDDEV * inferred * distance
         return np.where(measured, stddev**2, 1.0)[:, None, None] * _EYE3
 
-    def _filter(self, positions: FloatArray, noise: FloatArray, observed: BoolArray, step: float) -> BoolArray:
-        """Predict all joints, update the observed ones, reject those beyond the gate; returns (25,) rejected."""
+    def _filter(
+        self, positions: FloatArray, noise: FloatArray, observed: BoolArray, step: float
+    ) -> tuple[BoolArray, BoolArray]:
+        """Predict all joints, update the observed ones, reject those beyond the gate.
+
+        Returns:
+            (25,) those that moved suddenly, farther than white noise explains, and (25,) those that are rejected.
+        """
         kalman = self._kalman
         size = 3 * self._order
         carrier = self._carriers(observed)
@@ -367,7 +379,7 @@ class LinearKalmanFilter(JointSmoother):
         self._level = np.minimum(level + self.parameters.adaptation * surprise, _MOST_LEVEL)
         if not suspects.any():
             self._carry(carrier, ~observed)
-            return suspects
+            return suspects, suspects
 
         # Too far for white noise: a change of the slow error (another sensor sees the joint), a sudden movement, or an
         # outlier. Update these again with white and slow noise: a change of the slow error then disturbs the velocity
@@ -384,7 +396,7 @@ class LinearKalmanFilter(JointSmoother):
         self._prior_covariance = np.where(rejected[:, None, None], kalman.P_prior, prior_covariance)
         self._level[rejected] = level[rejected]  # an outlier does not raise the noise
         self._carry(carrier, ~observed | rejected)
-        return rejected
+        return suspects & ~rejected, rejected
 
     def _carriers(self, observed: BoolArray) -> IntArray:
         """(25,) the joint that carries each one: itself if it is observed now and was in the last frame."""
@@ -472,7 +484,7 @@ class LinearKalmanFilter(JointSmoother):
         state = self._kalman.x[:, :, 0]
         # copies, and plain arrays: the output must not change with the next frame
         positions: FloatArray = np.array(state[:, :3])
-        covariances: FloatArray = self._kalman.P[:, :3, :3] + self._slow
+        covariances: FloatArray = self._kalman.P[:, :3, :3] + self._systematic()
         velocities: FloatArray = np.array(state[:, 3:]) if self._order == 2 else np.full((N_JOINTS, 3), np.nan)
         states = np.where(used, skeleton.states, np.uint8(TrackingState.INFERRED))
         if not alive.all():
@@ -482,8 +494,12 @@ class LinearKalmanFilter(JointSmoother):
         stamp_ns, frame_id, body = skeleton.stamp_ns, skeleton.frame_id, skeleton.body
         return Skeleton(stamp_ns, frame_id, positions, states, body, covariances, velocities)
 
+    def _systematic(self) -> FloatArray:
+        """(25, 3, 3) square metres: covariance of what no filter removes, slow errors and the last jump."""
+        return self._slow + self._jumped[:, :, None] * self._jumped[:, None, :]
+
     def last_frame(self, filtered: Skeleton) -> JointFrame:
         """The estimate after the last frame that gave one, by the skeleton of it (``filters.smoothing``)."""
         kalman, alive, continued = self._kalman, self._alive, self._alive & ~self._started
         posterior, prior = (kalman.x, kalman.P), (kalman.x_prior, self._prior_covariance)
-        return JointFrame.of(filtered, posterior, self._slow, alive, continued, self._transition, prior)
+        return JointFrame.of(filtered, posterior, self._systematic(), alive, continued, self._transition, prior)

@@ -281,6 +281,27 @@ def test_an_outlier_is_rejected_and_a_move_for_good_is_followed() -> None:
     assert_array_equal(np.delete(first.states, Joint.WRIST_RIGHT), np.delete(TRACKED, Joint.WRIST_RIGHT))
 
 
+@pytest.mark.parametrize("jump", [0.2, 0.5])
+def test_after_a_jump_the_deviation_includes_it_and_fades(jump: float) -> None:
+    """One jump is accepted as a sudden movement, the other is rejected until the joint restarts."""
+    tracker = LinearKalmanFilter(CONSTANT_VELOCITY)
+    before = run(tracker, np.stack([BODY] * 10))[-1]
+    moved = BODY.copy()
+    moved[Joint.ELBOW_RIGHT] += [0.0, jump, 0.0]
+    frames = run(tracker, np.stack([moved] * 30), start_ns=1 + 10 * FRAME_NS)
+    steps, stddev = (
+        np.array([read(each) for each in [before, *frames]])
+        for read in (
+            lambda each: each.positions[Joint.ELBOW_RIGHT, 1],
+            lambda each: np.sqrt(each.covariances[Joint.ELBOW_RIGHT, 1, 1]),
+        )
+    )
+    largest = int(np.abs(np.diff(steps)).argmax()) + 1
+    assert tracker.counters["reacquired"] == (jump > 0.4)
+    assert stddev[largest] > 0.9 * abs(steps[largest] - steps[largest - 1])
+    assert stddev[-1] < 1.02 * stddev[0]
+
+
 def test_a_punch_is_followed() -> None:
     """An elbow that is thrust forward at 45 m/s2 and stopped as hard; without adaptation it is left half a metre."""
     elbow = Joint.ELBOW_RIGHT
