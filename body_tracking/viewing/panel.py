@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -26,8 +27,6 @@ BUTTONS: Final[Mapping[str, tuple[str, Mapping[str, str]]]] = {
 
 _REST_S: Final = 0.4
 """Seconds for which the slider must rest before the bag goes there."""
-_HELD_S: Final = 2.5
-"""Seconds after a move by the user in which the slider does not follow the bag: until its next diagnostics."""
 
 
 class ControlPanel:
@@ -66,7 +65,8 @@ class ControlPanel:
             self._groups["skeleton_filter"], self._groups["joint_angles"] = [self._filter], [self._convention]
         self._running: dict[str, str] = {}
         """What skeleton_filter and joint_angles last said that they run, and whether the player loops."""
-        self._moved, self._resting = -_HELD_S, threading.Timer(0.0, lambda: None)  # of the server's event loop
+        # Of the server's event loop: the steady time from which reports of the bag's place move the slider.
+        self._follows_from, self._resting = -math.inf, threading.Timer(0.0, lambda: None)
         self._place.on_update(self._on_place)
         self._loop.on_update(self._on_loop)
 
@@ -88,19 +88,20 @@ class ControlPanel:
             self._follow(player)
 
     def _follow(self, player: NodeStatus) -> None:
-        """Move the slider to the bag's place, unless the user moves it."""
+        """Move the slider to the bag's place, unless the user has moved it and the bag is not yet there."""
         length, place = player.number("duration s") or 0.0, player.number("position s") or 0.0
         last = max(0.1, int(10.0 * length) / 10.0)  # not after the last message
         if self._place.max != last:
             self._place.max = last
-        self._server.get_event_loop().call_soon_threadsafe(self._show_place, min(max(0.0, round(place, 1)), last))
+        shown = min(max(0.0, round(place, 1)), last)
+        self._server.get_event_loop().call_soon_threadsafe(self._show_place, shown, player.received)
         loops = player.values.get("loop", "")
         if loops != self._running.get(PLAYER):
             self._loop.value, self._running[PLAYER] = loops == "True", loops
 
-    def _show_place(self, place: float) -> None:
+    def _show_place(self, place: float, reported: float) -> None:
         """In the server's event loop, as :meth:`_on_place`: so it cannot come between a move and the reading of it."""
-        if time.monotonic() - self._moved > _HELD_S:
+        if reported > self._follows_from:
             self._place.value = place
 
     def draw_bodies(self, bodies: Sequence[str], chosen: str) -> None:
@@ -114,7 +115,7 @@ class ControlPanel:
     async def _on_place(self, event: viser.GuiEvent[Any]) -> None:
         if event.client is None:  # by _show_place
             return
-        self._moved = time.monotonic()
+        self._follows_from = math.inf  # until the bag is there
         self._resting.cancel()
         self._resting = threading.Timer(_REST_S, self._seek, (float(self._place.value),))
         self._resting.daemon = True
@@ -122,6 +123,11 @@ class ControlPanel:
 
     def _seek(self, place: float) -> None:
         self._answer("bag: time", lambda: self._controls.seek(place))
+        self._server.get_event_loop().call_soon_threadsafe(self._on_sought, threading.current_thread())
+
+    def _on_sought(self, resting: threading.Thread) -> None:
+        if resting is self._resting:  # no move since
+            self._follows_from = time.monotonic()
 
     def _on_loop(self, event: viser.GuiEvent[Any]) -> None:
         if event.client is not None:

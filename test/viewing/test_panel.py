@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import importlib
+import queue
 import threading
+import time
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -17,6 +20,7 @@ from body_tracking.messages.node_status import NodeStatus
 from body_tracking.viewing.panel import ControlPanel
 from body_tracking.viewing.server import serve, stop
 from body_tracking.viewing.snapshot import PageError
+from patience import PATIENCE
 
 
 class Choice(SimpleNamespace):
@@ -100,28 +104,72 @@ def server() -> Iterator[Any]:
     stop(server)
 
 
+class Slider:
+    """The slider of a panel at a real server, in which a user moves it; the bag has 15.4 s.
+
+    Attributes:
+        sought: the places that the bag was sent to.
+        answer: the player's answer waits for it.
+    """
+
+    def __init__(self, server: Any) -> None:
+        self.server, self.sought, self.answer = server, queue.Queue[float](), threading.Event()
+        self.panel = ControlPanel(server, controls := MagicMock(), ("lkf",), ("positional",))
+        controls.seek.side_effect = self._seek
+        server._connected_clients[1] = MagicMock()
+        inputs = server.gui._gui_input_handle_from_uuid.values()
+        (self.handle,) = (each for each in inputs if type(each).__name__ == "GuiSliderHandle")
+
+    def _seek(self, place: float) -> str:
+        self.sought.put(place)
+        assert self.answer.wait(PATIENCE)
+        return f"plays on from {place} s"
+
+    def report(self, place: float, received: float | None = None) -> None:
+        """The player says where the bag is."""
+        values = {"duration s": "15.4", "position s": str(place), "loop": "False"}
+        at = time.monotonic() if received is None else received
+        self.panel.draw({"bag_player": NodeStatus("bag_player: bag", 0, "playing", values, at)}, at, False)
+        self._in_loop(asyncio.sleep(0.0))
+
+    def move(self, place: float) -> None:
+        """The browser says that the user moved it."""
+        message = importlib.import_module("viser._messages").GuiUpdateMessage(self.handle._impl.uuid, {"value": place})
+        self._in_loop(self.server.gui._handle_gui_updates(1, message))
+
+    def _in_loop(self, work: Any) -> None:
+        asyncio.run_coroutine_threadsafe(work, self.server.get_event_loop()).result(PATIENCE)
+
+
 def test_a_move_of_the_slider_is_not_undone_by_a_report_that_comes_before_it_is_read(server: Any) -> None:
     """The server calls back in one of 32 threads. Here they are busy, as they may be while a page waits for answers."""
-    viser = pytest.importorskip("viser")
-    gui, sought, over = server.gui, threading.Event(), threading.Event()
-    panel = ControlPanel(server, controls := MagicMock(), ("lkf",), ("positional",))
-    controls.seek.side_effect = lambda place: sought.set() or f"plays on from {place} s"
-
-    def report(place: float) -> None:
-        values = {"duration s": "15.4", "position s": str(place), "loop": "False"}
-        panel.draw({"bag_player": NodeStatus("bag_player: bag", 0, "playing", values)}, 0.0, False)
-        asyncio.run_coroutine_threadsafe(asyncio.sleep(0.0), server.get_event_loop()).result(10.0)
-
-    report(2.0)
-    (slider,) = (each for each in gui._gui_input_handle_from_uuid.values() if isinstance(each, viser.GuiSliderHandle))
-    assert slider.value == 2.0
+    slider, over = Slider(server), threading.Event()
+    slider.answer.set()
+    slider.report(2.0)
+    assert slider.handle.value == 2.0
     for _ in range(server._thread_executor._max_workers):
-        server._thread_executor.submit(over.wait, 10.0)
-    server._connected_clients[1] = MagicMock()
-    move = viser._messages.GuiUpdateMessage(slider._impl.uuid, {"value": 12.0})
-    asyncio.run_coroutine_threadsafe(gui._handle_gui_updates(1, move), server.get_event_loop()).result(10.0)
-    report(3.0)
+        server._thread_executor.submit(over.wait, PATIENCE)
+    slider.move(12.0)
+    slider.report(3.0)
     over.set()
-    assert sought.wait(10.0)
-    controls.seek.assert_called_once_with(12.0)
-    assert slider.value == 12.0
+    assert slider.sought.get(timeout=PATIENCE) == 12.0
+
+
+def test_the_slider_follows_the_bag_again_as_soon_as_it_is_there(server: Any) -> None:
+    """Held for longer, it would still be at 0.0 s when the user wants to go there once more: no move for a browser."""
+    slider = Slider(server)
+    slider.report(5.0)
+    slider.move(0.0)
+    assert slider.sought.get(timeout=PATIENCE) == 0.0
+    slider.report(6.0)  # not yet there
+    assert slider.handle.value == 0.0
+    asked = time.monotonic()
+    slider.answer.set()
+    end = time.monotonic() + PATIENCE
+    while slider.handle.value == 0.0 and time.monotonic() < end:
+        slider.report(6.5, asked)  # from before
+        assert slider.handle.value == 0.0
+        slider.report(0.7)
+    assert slider.handle.value == 0.7
+    slider.move(0.0)
+    assert slider.sought.get(timeout=PATIENCE) == 0.0
