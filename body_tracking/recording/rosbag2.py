@@ -158,6 +158,10 @@ class RawMessage(NamedTuple):
 # --- reading
 
 
+class UnsupportedBagError(BagError):
+    """Raised for a bag of another storage than mcap, or with rosbag2's own compression."""
+
+
 class BagReader:
     """Reads a bag: a folder, also without its ``metadata.yaml``, or a single mcap file.
 
@@ -271,27 +275,13 @@ class BagReader:
 
     def _listed(self) -> list[Path] | None:
         """The files listed in ``metadata.yaml``; None if it is missing or unreadable."""
-        path = self.path / METADATA
-        if not path.exists():
+        if not (self.path / METADATA).exists():
             self._notes.append(f"{self.path.name}: {METADATA} is missing: the recording was not closed")
             return None
-        if not path.is_file():
-            raise BagError(f"{path}: not a regular file")
-        try:
-            information = load_yaml(read_text(path))["rosbag2_bagfile_information"]
-            storage = information["storage_identifier"]
-            compression = str(information.get("compression_mode") or "none").lower()
-            names = [Path(str(name)).name for name in information["relative_file_paths"]]
-        except FileLimitError as error:
-            raise BagError(f"{path}: {error}") from error
-        except (FileError, KeyError, TypeError, AttributeError):
+        listed = _listed_in(self.path)
+        if listed is None:
             self._notes.append(f"{METADATA}: damaged; the mcap files were read without it")
-            return None
-        if storage != "mcap" and not any(name.endswith(".mcap") for name in names):
-            raise BagError(f"{self.path}: storage {storage!r} is not supported, only mcap")
-        if compression != "none":
-            raise BagError(f"{self.path}: rosbag2 compression mode {compression!r} is not supported, only mcap's own")
-        return [self.path / name for name in names]
+        return listed
 
     def _topics(self) -> dict[str, TopicInfo]:
         topics: dict[str, TopicInfo] = {}
@@ -316,6 +306,43 @@ def _add(topics: dict[str, TopicInfo], name: str, more: TopicInfo) -> None:
     known = topics.get(name, TopicInfo(more.type_name, 0))
     offered = tuple(dict.fromkeys(known.offered + more.offered))
     topics[name] = TopicInfo(known.type_name, known.count + more.count, offered)
+
+
+def _listed_in(folder: Path) -> list[Path] | None:
+    """The files listed in a folder's ``metadata.yaml``; None if it is damaged.
+
+    Raises:
+        UnsupportedBagError: another storage than mcap, or rosbag2's own compression.
+        BagError: no regular file, or larger than a limit.
+    """
+    path = folder / METADATA
+    if not path.is_file():
+        raise BagError(f"{path}: not a regular file")
+    try:
+        information = load_yaml(read_text(path))["rosbag2_bagfile_information"]
+        storage = information["storage_identifier"]
+        compression = str(information.get("compression_mode") or "none").lower()
+        names = [Path(str(name)).name for name in information["relative_file_paths"]]
+    except FileLimitError as error:
+        raise BagError(f"{path}: {error}") from error
+    except (FileError, KeyError, TypeError, AttributeError):
+        return None
+    if storage != "mcap" and not any(name.endswith(".mcap") for name in names):
+        raise UnsupportedBagError(f"{folder}: storage {storage!r} is not supported, only mcap")
+    if compression != "none":
+        text = f"rosbag2 compression mode {compression!r} is not supported, only mcap's own"
+        raise UnsupportedBagError(f"{folder}: {text}")
+    return [folder / name for name in names]
+
+
+def _refuse_unsupported(folder: Path) -> None:
+    """Raise where only ``metadata.yaml``, which is to be written anew, says how the messages are stored."""
+    try:
+        _listed_in(folder)
+    except UnsupportedBagError:
+        raise
+    except BagError:
+        pass  # missing, or no file of rosbag2
 
 
 def _natural(path: Path) -> tuple[str, int]:
@@ -515,6 +542,8 @@ class BagWriter:
             raise BagError(f"{self.folder}: exists and is no bag")
         for path in parts:
             _refuse_if_in_use(path)
+        if resume and not overwrite:
+            _refuse_unsupported(self.folder)
         # The list of files is outdated from here on; readers find the files without it.
         (self.folder / METADATA).unlink(missing_ok=True)
         if overwrite:
@@ -561,13 +590,14 @@ def recover(folder: Path | str) -> BagReader:
         A reader of the closed bag.
 
     Raises:
-        BagError: it is no bag, it is still being recorded, or it cannot be written.
+        BagError: it is no bag or one that is not supported, it is still being recorded, or it cannot be written.
     """
     folder = Path(folder)
+    _refuse_unsupported(folder)
     paths = _files(folder)
     if not paths:
-        reason = "no mcap file is in the folder" if folder.is_dir() else "no such folder"
-        raise BagError(f"{folder}: {'not a folder' if folder.is_file() else reason}")
+        reason = "not a folder" if folder.exists() else "no such folder"
+        raise BagError(f"{folder}: {'no mcap file is in the folder' if folder.is_dir() else reason}")
     try:
         for path in paths:
             _refuse_if_in_use(path)

@@ -114,13 +114,18 @@ def clock() -> Finding:
 
 def bag(path: Path) -> Iterator[Finding]:
     """Findings on a folder or a single mcap file."""
-    from body_tracking.recording.info import bag_info  # needs libraries whose absence the doctor has to name
+    # these need libraries whose absence the doctor has to name
+    from body_tracking.recording.info import bag_info
+    from body_tracking.recording.rosbag2 import UnsupportedBagError
 
     recover = f"body_tracking bag recover {path}"
     try:
         info = bag_info(path)
+    except UnsupportedBagError as error:
+        yield Finding(PROBLEM, str(error), "ros2 bag convert, to storage mcap and without compression")
+        return
     except BodyTrackingError as error:
-        yield Finding(PROBLEM, str(error), recover if path.is_dir() else "give the folder that the recorder made")
+        yield Finding(PROBLEM, str(error), "give the folder that the recorder made; of this one nothing can be read")
         return
     yield Finding(OK, f"{path}: {info.messages} messages in {info.duration_s:.1f} s")
     for warning in info.warnings:

@@ -69,6 +69,18 @@ def test_a_bag_that_was_cut_off_is_played_in_part(tmp_path: Path) -> None:
         assert worst(bag(unreadable))[0] == PROBLEM
 
 
+def test_the_remedy_for_a_bag_that_cannot_be_read_is_one_that_helps(tmp_path: Path) -> None:
+    """``bag recover`` closes bags; it converts none, and finds nothing in an empty folder."""
+    metadata = "rosbag2_bagfile_information: {storage_identifier: sqlite3, relative_file_paths: [a.db3]}"
+    for name, text in (("db3", metadata), ("empty", "")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "metadata.yaml").write_text(text)
+    (found,) = bag(tmp_path / "db3")
+    assert "ros2 bag convert" in found.remedy
+    (found,) = bag(tmp_path / "empty")
+    assert "recover" not in found.remedy
+
+
 def _copy(target: Path, keep: slice, leave_out: tuple[float, float] = (0.0, 0.0)) -> Path:
     """Some topics of the bag, without the messages of a time in seconds."""
     with BagReader(BAG) as reader, BagWriter(target) as writer:

@@ -211,6 +211,7 @@ def test_recovering_says_what_was_missing_and_leaves_a_whole_bag_as_it_is(tmp_pa
         (["bag", "recover", "taken"], "no mcap file"),
         (["bag", "recover", "absent"], "absent: no such folder"),
         (["bag", "recover", "a.txt"], "a.txt: not a folder"),
+        (["bag", "recover", "pipe.csv"], "pipe.csv: not a folder"),
     ],
 )
 def test_errors_are_one_line(tmp_path, monkeypatch, capsys, arguments, text):

@@ -29,6 +29,7 @@ from body_tracking.recording.rosbag2 import (
     BagError,
     BagReader,
     BagWriter,
+    UnsupportedBagError,
     deserialize,
     recover,
     serialize,
@@ -443,6 +444,23 @@ def test_a_folder_that_is_no_bag_is_never_touched(tmp_path, option):
     with pytest.raises(BagError, match="no bag"):
         BagWriter(tmp_path, **{option: True})
     assert (tmp_path / "chapter.txt").read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [{"compression_mode": "MESSAGE"}, {"storage_identifier": "sqlite3", "relative_file_paths": ["bag_0.db3"]}],
+)
+def test_what_only_the_metadata_says_of_a_bag_is_not_overwritten(tmp_path, changed):
+    """Without them ``ros2 bag`` would take compressed messages for whole ones."""
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        writer.add_connection("/text", "std_msgs/msg/String", typestore=TYPES)
+    metadata = tmp_path / "bag" / "metadata.yaml"
+    information = yaml.safe_load(metadata.read_text())["rosbag2_bagfile_information"]
+    metadata.write_text(before := yaml.safe_dump({"rosbag2_bagfile_information": information | changed}))
+    for touch in (recover, lambda folder: BagWriter(folder, resume=True)):
+        with pytest.raises(UnsupportedBagError, match=r"bag: .* is not supported"):
+            touch(tmp_path / "bag")
+        assert metadata.read_text() == before
 
 
 def test_two_writers_do_not_share_a_bag(tmp_path):
