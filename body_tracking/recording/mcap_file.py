@@ -266,7 +266,8 @@ class McapFile:
         if size == 0:
             raise BagError(f"{self.path}: the file is empty")
         if not MAGIC.startswith(self._bytes_at(0, len(MAGIC))):
-            raise BagError(f"{self.path}: not an mcap file")
+            way = "" if self.path.suffix == ".mcap" else "; body_tracking import makes a bag of other formats"
+            raise BagError(f"{self.path}: not an mcap file{way}")
         self.whole = False
         self.whole = self._read_summary(size)
         if not self.whole:

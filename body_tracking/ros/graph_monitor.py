@@ -40,6 +40,12 @@ def calibration_part(status: NodeStatus | None, sensors: Collection[str]) -> lis
     return [f"calibration: {status.text if status is not None else 'none'}"]
 
 
+def problem_parts(statuses: Mapping[str, NodeStatus]) -> list[str]:
+    """What nodes report as a problem, by their names; without the calibration, which has a part of its own."""
+    bad = {name: each.text for name, each in statuses.items() if each.level and each.text and name != "calibration"}
+    return [f"{name}: {text}" for name, text in sorted(bad.items())]
+
+
 class GraphMonitor:
     """Subscribes in its own thread.
 
@@ -149,6 +155,8 @@ class GraphMonitor:
         if delay:
             parts.append(delay)
         parts += calibration_part(fresh.get("calibration"), sensors_of(options))
+        if not self.angles:
+            parts += problem_parts(fresh)
         malformed = sum(int(status.values.get("malformed", 0)) for status in fresh.values())
         if malformed:
             parts.append(f"malformed {malformed}")
@@ -195,6 +203,8 @@ class GraphMonitor:
         """The last line of a run."""
         what = f"played {options['bag']}" if options["bag"] else "ran"
         text = f"{what} for {elapsed:.1f} s: {self.angles} frames of joint angles"
+        problems = () if self.angles else problem_parts(self._statuses)
+        text += f" ({'; '.join(problems)})" if problems else ""
         if options["record"]:
             text += f", recorded in {options['record']}"
         if restarts:

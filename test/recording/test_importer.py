@@ -207,7 +207,7 @@ def test_recovering_says_what_was_missing_and_leaves_a_whole_bag_as_it_is(tmp_pa
         (["import", "a.csv", "-o", "taken", "--overwrite"], "no bag"),
         (["import", "a.csv", "-o", "a.txt/bag"], "a.txt/bag"),
         (["bag", "info", "absent"], "no such recording"),
-        (["bag", "info", "a.txt"], "not an mcap file"),
+        (["bag", "info", "a.txt"], "not an mcap file; body_tracking import makes a bag"),
         (["bag", "recover", "taken"], "no mcap file"),
         (["bag", "recover", "absent"], "absent: no such folder"),
         (["bag", "recover", "a.txt"], "a.txt: not a folder"),
