@@ -17,7 +17,7 @@ ExtendedKalmanFilter has a plain vector as state, and inverts the matrices that 
   Their effect on the pose is added to the output covariance.
 - Orientations of segments by inertial sensors come at their own times; the errors of their sources are estimated in
   additional states (``sources``), which exist only with such sources.
-- Fixed-lag smoothing (``smoothing``), where it is asked for, reads states and changes none.
+- Optional fixed-lag smoothing (``smoothing``) reads states and changes none.
 
 Modules: settings (``parameters``), state vector (``state``), motion model (``motion``), errors of cameras and of
 sources of orientations (``sensor_errors``, ``sources``), updates by frames (``skeletons``) and orientations

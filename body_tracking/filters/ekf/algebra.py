@@ -1,4 +1,4 @@
-"""Small matrices, compiled: triangular factors, and how far a linearisation reaches."""
+"""Compiled routines for small matrices (Cholesky factors), and the limits of a linearisation."""
 
 from __future__ import annotations
 
@@ -10,13 +10,15 @@ from body_tracking.core.compiled import compiled
 from body_tracking.core.skeleton import FloatArray
 
 LINEARISATIONS = 4
+"""Greatest number of linearisations in one update."""
 FAR, CLOSE = 0.2, 0.05
-"""Radians: a correction farther than the first is linearised anew, until it changes by less than the second."""
+"""Radians: an update with a correction of ``FAR`` or more is linearised anew, until the correction changes by less than
+``CLOSE``."""
 
 
 @compiled
 def factored(matrix: FloatArray) -> bool:
-    """Cholesky's factor U of a symmetric matrix U^T U, in the upper triangle in place; False where there is none."""
+    """Write the Cholesky factor U of a matrix U^T U into its upper triangle; False if it is not positive definite."""
     size = len(matrix)
     for k in range(size):
         pivot = matrix[k, k]
@@ -65,7 +67,7 @@ def invert(factor: FloatArray, inverse: FloatArray) -> None:
 
 @compiled
 def squared_distance(block: FloatArray, vector: FloatArray, added: float) -> float:
-    """Squared Mahalanobis distance of (3,) by (3, 3) with ``added`` on its diagonal."""
+    """Squared Mahalanobis distance of ``vector`` (3,) with the covariance ``block`` (3, 3) plus ``added`` times I."""
     x, y, z = vector
     # C = L D L^T, and L w = v
     xx = block[0, 0] + added
@@ -81,7 +83,7 @@ def squared_distance(block: FloatArray, vector: FloatArray, added: float) -> flo
 
 
 def whitening_of(covariance: FloatArray) -> FloatArray:
-    """(k, k) inverse of the lower Cholesky factor; changes the covariance.
+    """(k, k) inverse of the lower Cholesky factor; overwrites the covariance.
 
     Raises:
         LinAlgError: the matrix is not positive definite, or not finite.

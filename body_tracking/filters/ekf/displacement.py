@@ -1,4 +1,4 @@
-"""Effect of unknown offsets of a sensor's joint centres on the pose, as far as no T-pose has shown them."""
+"""Effect on the pose of those offsets of a sensor's joint centres that no T-pose has measured."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _DIMENSIONS = 3
 
 
 class Displacement:
-    """Covariance of a pose by these offsets.
+    """Computes the covariance of a pose due to these offsets.
 
     Args:
         space: of the states.
@@ -36,13 +36,13 @@ class Displacement:
     def displaced(self, state: State) -> tuple[FloatArray, FloatArray]:
         """(53, 53) covariance of tangent and lengths by offsets of the joint centres; (53,) change by rejected points.
 
-        A rejected point is either an outlier, or shows a pose that the filter has lost, off by this change (the
-        spread of innovations of probabilistic data association, Bar-Shalom and Tse 1975).
+        A rejected point is either an outlier, or a sign that the filter's pose is wrong by this change (the spread of
+        innovations of probabilistic data association, Bar-Shalom and Tse 1975).
 
-        By constant offsets ``b`` of covariance ``B`` the pose that fits best is off by ``G b`` with
-        ``G = (H^T W H + P^-1)^-1 H^T W``, where ``W`` is how the filter weighs the points and ``P`` what is known
-        without any measurement: ``G B G^T``. To first order: forearms and hands, which are hardly longer than the
-        offsets, err by more.
+        Constant offsets ``b`` of covariance ``B`` change the best-fitting pose by ``G b`` with
+        ``G = (H^T W H + P^-1)^-1 H^T W``, where ``W`` holds the filter's weights of the points and ``P`` is the prior
+        covariance; the result is ``G B G^T``. This is first order: forearms and hands, hardly longer than the offsets,
+        err by more.
         """
         space = self._space
         lines = space.model.linearised(state.q, state.lengths)
@@ -64,7 +64,7 @@ class Displacement:
         return gain @ spread @ gain.T, gain @ state.disputed
 
     def _left(self, state: State, lines: Linearised) -> FloatArray:
-        """(57, 57) covariance of the points' offsets after a T-pose."""
+        """(57, 57) square metres: covariance of the points' offsets that remain after a T-pose."""
         positions = np.full((N_JOINTS, _DIMENSIONS), np.nan)
         positions[self._space.model.joints] = lines.posture.positions
         spread: FloatArray = self._centres.spread(positions, state.stamp_ns)[np.ix_(self._rows, self._rows)]

@@ -13,7 +13,7 @@ from body_tracking.filters.ekf.state import State, StateSpace
 
 _IMPROBABLE = 20.0
 """Squared normalised distance of the twists of both arms from the middle of their ranges (chi-square with 4 degrees of
-freedom) that one of 2000 poses has: rather than that, the filter is wrong about which way the person faces."""
+freedom) that one of 2000 poses exceeds: beyond it, the filter's facing of the person is probably wrong."""
 _TWISTS = ("shoulder_z", "forearm_pronation")
 _SPEAKING_NS = NANOSECONDS // 4
 """A source without a measurement for longer is ignored."""
@@ -21,7 +21,8 @@ _LIMBS = {"upper_arm": ("SHOULDER", "ELBOW"), "forearm": ("ELBOW", "WRIST")}
 _DIRECTION_STDDEV = 0.35
 """Radians: standard deviation of a limb's direction by a camera."""
 _MOST, _DOUBTED = 1.0, 10.0
-"""Log likelihood ratios: greatest of one frame, as errors of the next are correlated, and the one that decides."""
+"""Log likelihood ratios: bound for one frame, as errors of successive frames are correlated, and threshold of their sum
+beyond which the state is doubted."""
 
 
 class Facing:
@@ -29,8 +30,8 @@ class Facing:
 
     A Kinect assumes that every body faces it, and swaps left and right of one that has turned away. A filter that has
     followed the turn detects the swap. With cameras alone its facing may be wrong from the start; a measured
-    orientation of an arm shows this: the arms would be twisted beyond their ranges, or that arm points where the other
-    one is seen.
+    orientation of an arm shows this: the arms would be twisted beyond their ranges, or the measured arm points where
+    the other one is seen.
 
     Args:
         space: of the states.
@@ -48,16 +49,16 @@ class Facing:
         }
 
     def corrected(self, state: State, skeleton: Skeleton) -> tuple[State, Skeleton]:
-        """A frame with left and right swapped if that is likelier.
+        """Swap left and right of a frame if the swapped frame is likelier.
 
         Args:
             state: of the frame's time.
             skeleton: in the state's frame of reference.
 
         Returns:
-            The updated state and the frame. The frame is unchanged if both have the same sense, no source is
-            informative, or the state is doubted; else left and right of the upper body, the lower body or both are
-            swapped, or removed where their axis is across the state's.
+            The updated state and the frame. The frame is unchanged if both face the same way, no source is active, or
+            the state is doubted; else left and right of the upper body, the lower body or both are swapped, or removed
+            where their heading is across the state's.
         """
         speaking = state.stamp_ns - state.sources.stamps < _SPEAKING_NS
         if not speaking.any():
@@ -84,7 +85,7 @@ class Facing:
         return state, replace(skeleton, positions=points, states=states, covariances=covariances)
 
     def _evidence(self, posture: Posture, segments: IntArray, skeleton: Skeleton) -> float:
-        """Log likelihood ratio of limbs with measured orientations as seen against swapped."""
+        """Log likelihood ratio of a frame as seen against swapped, from the limbs with measured orientations."""
         evidence = 0.0
         for number in segments.tolist():
             if number not in self._ends:
@@ -100,12 +101,12 @@ class Facing:
         return float(np.clip(evidence, -_MOST, _MOST))
 
     def _is_improbable(self, state: State) -> bool:
-        """Whether arms are as twisted as with a body of the wrong facing."""
+        """Whether the arms are twisted so far that the state's facing is probably wrong."""
         ranges = self._space.ranges
         away = (ranges.values(state.q) - ranges.centre)[self._twists] / ranges.stddev[self._twists]
         return float(away @ away) > _IMPROBABLE
 
 
 def _angle(axis: FloatArray, direction: FloatArray) -> float:
-    """Radians between a unit vector and another one; NaN where that is not known."""
+    """Radians between a unit vector and a direction of any length; NaN if the direction is."""
     return float(np.arctan2(np.linalg.norm(np.cross(axis, direction)), axis @ direction))

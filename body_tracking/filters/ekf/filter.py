@@ -1,4 +1,4 @@
-"""The extended filter: frames and orientations in the order of their time.
+"""The extended filter: processes frames and orientations in the order of their stamps.
 
 Over 500 lines: the estimator's issue rewrites this folder.
 """
@@ -34,22 +34,22 @@ from body_tracking.kinematics.lengths import SegmentLengths
 _TRACKED = np.uint8(TrackingState.TRACKED)
 _EYE3 = np.eye(3)
 _START_FRAMES = 4
-"""Frames of one sensor for an estimate of its noise."""
+"""Number of frames of one sensor that start the filter: they give an estimate of its noise."""
 _WAIT_NS = NANOSECONDS // 2
-"""Frames farther apart than this do not make a start together."""
+"""Greatest time between the frames that start the filter together."""
 _START_AFTER_NS = NANOSECONDS
-"""Without a skeleton for so long the body is started by orientations alone."""
+"""After this time without a skeleton, orientations alone start the body."""
 _PREPARED = 10
 """Frames after which all compiled functions have run."""
 _MAX_COORDINATE = 100.0
 _LONGEST_WAIT_NS = NANOSECONDS // 10
 """Greatest time that an orientation is queued without a request for the estimate."""
 _DISORDER_NS = NANOSECONDS // 300
-"""Orientations of times so close to each other may come in any order."""
+"""Orientations may arrive out of order by up to this time."""
 _BREAKS = ("restarts", "branches", "slips", "broken_covariances", "frame_changes", "gaps")
-"""Counters of events after which a pose is not the continuation of the one before."""
+"""Counters of events that break the continuity of the pose."""
 _UNPLACED_STDDEV, _UNTURNED_STDDEV = 100.0, 1.0
-"""Metres and radians: of the base where orientations alone start the body."""
+"""Metres and radians: standard deviations of the base when orientations alone start the body."""
 
 
 class ExtendedKalmanFilter:
@@ -57,7 +57,7 @@ class ExtendedKalmanFilter:
 
     Attributes:
         model: the body.
-        counters: what happened since the construction, for diagnostics.
+        counters: events since the construction, for diagnostics.
     """
 
     def __init__(self, parameters: EkfParameters | None = None, model: CompiledUpperBody | None = None) -> None:
@@ -133,12 +133,12 @@ class ExtendedKalmanFilter:
 
     @property
     def innovation_distance(self) -> float:
-        """The last frame's normalised innovation squared over all its accepted points; NaN before a first."""
+        """The last frame's normalised innovation squared over all its accepted points; NaN before the first one."""
         return self._skeletons.innovation_distance
 
     @property
     def innovation_dimension(self) -> int:
-        """Its expectation."""
+        """Expectation of :attr:`innovation_distance`: the number of accepted coordinates."""
         return self._skeletons.innovation_dimension
 
     def start(
@@ -148,8 +148,8 @@ class ExtendedKalmanFilter:
 
         Args:
             q: (35,) configuration.
-            lengths: (21,) metres; those of an average person where None.
-            stamp_ns: when it is so.
+            lengths: (21,) metres; those of an average person if None.
+            stamp_ns: time of the pose.
             frame_id: of the base.
         """
         self.reset()
@@ -162,20 +162,20 @@ class ExtendedKalmanFilter:
         """Take one frame and return the filtered skeleton: :meth:`take`, then :attr:`filtered`.
 
         Returns:
-            None where the frame is a repetition, came late, or shows no trunk yet.
+            None if the frame is repeated or late, or shows no trunk yet.
         """
         return self.filtered if self.take(skeleton, sensor) else None
 
     def take(self, skeleton: Skeleton, sensor: str = "") -> bool:
-        """Take one frame; one that comes late counts from when the estimate is next needed, together with others.
+        """Take one frame; a late one is queued until the estimate is next requested.
 
         Args:
             skeleton: in a fixed frame with z up; ``/fused/skeleton``, or one sensor's brought into ``world``.
-            sensor: whose it is, as each has its own noise.
+            sensor: its name; each sensor has its own noise.
 
         Returns:
-            Whether there is an estimate of its time now: not where the frame is a repetition, came late, or shows no
-            trunk yet.
+            Whether there is now an estimate at its stamp: False if the frame is repeated or late, or shows no trunk
+            yet.
         """
         measurement = self._measurement(skeleton, sensor)
         state = self._last
@@ -190,7 +190,7 @@ class ExtendedKalmanFilter:
         if state is not None and state.unplaced:
             return self._placed(measurement)
         if state is not None and (self._is_awaited(measurement) or self._is_late(measurement, state)):
-            # orientations come sooner than frames of the same time, which are the newest of their kind all the same
+            # orientations arrive before frames of the same time: such a frame is overtaken, but not late
             overtaken = self._is_awaited(measurement) or bool((state.sources.stamps >= measurement.stamp_ns).any())
             late = not overtaken or self._newest is None or measurement.stamp_ns < self._newest.stamp_ns
             self.counters["late_frames"] += late
@@ -208,13 +208,13 @@ class ExtendedKalmanFilter:
         return True
 
     def take_orientation(self, measurement: SegmentOrientation) -> bool:
-        """Take the orientation of one segment, at its own time among frames and others.
+        """Take the orientation of one segment, to be processed in the order of the stamps.
 
-        Where there are no skeletons, the body is started after a second by orientations alone, its base at the
-        origin with the deviation of an unknown position. The first skeletons then restart it.
+        Without skeletons, orientations alone start the body after a second, with its base at the origin and the
+        deviation of an unknown position. The first skeletons then restart it.
 
         Returns:
-            Whether there is an estimate of about its time now: not where it is a repetition or came late.
+            Whether there is now an estimate at about its stamp: False if the orientation is repeated or late.
         """
         self.counters["orientations"] += 1
         state = self._last
@@ -234,24 +234,24 @@ class ExtendedKalmanFilter:
         return not late
 
     def settle(self, until_ns: int) -> None:
-        """Take orientations that wait, as far as none of an earlier time is likely to come; it changes no result.
+        """Process the queued orientations that no earlier measurement is likely to precede; results do not change.
 
-        What is taken while there is nothing else to do need not be taken when the next frame comes.
+        Called while idle, this shortens the processing of the next frame.
 
         Args:
-            until_ns: before this time no frame is to be expected any more.
+            until_ns: no frame is expected before this time.
         """
         state = self._last
         if state is None or not self._late:
             return
         until_ns = min(until_ns, max(each.stamp_ns for each in self._late) - _DISORDER_NS)
-        # others of before the last frame may still come, and it would have to be taken again for each of them
+        # more orientations from before the last frame may arrive, and each would cause a replay of that frame
         if until_ns > state.stamp_ns:
             self._last = self._replay(state, until_ns)
 
     @property
     def filtered(self) -> Skeleton | None:
-        """The modelled joints after the last frame in its order, with covariances and velocities; None before a first.
+        """The modelled joints at the latest frame, with covariances and velocities; None before the first one.
 
         INFERRED where predicted, NOT_TRACKED where not modelled.
         """
@@ -266,11 +266,11 @@ class ExtendedKalmanFilter:
 
     @property
     def estimate(self) -> ModelEstimate | None:
-        """The state of the model after the last frame; None before a first."""
+        """The state of the model at the latest frame; None before the first one."""
         return None if self._state is None else self._output.estimate(self._state, self._frame_id, self._body())
 
     def predict(self, stamp_ns: int) -> tuple[Skeleton, ModelEstimate] | None:
-        """What is to be expected at a later time, without any change of the filter; None where the person is lost."""
+        """The prediction at a later time, without changing the filter; None if the person is lost."""
         state = self._state
         if state is None:
             return None
@@ -284,22 +284,22 @@ class ExtendedKalmanFilter:
     # --- smoothing (filters.smoothing)
 
     def last_frame(self, filtered: Skeleton | None = None) -> Frame:
-        """The estimate after the last frame in its order."""
+        """The estimate at the latest frame."""
         state = self._state
         assert state is not None
         skeleton = self._newest or self._empty(state.stamp_ns)
         return self._smoother.frame(state, skeleton, sum(self.counters[name] for name in _BREAKS))
 
     def link(self, before: Frame, after: Frame) -> Link | None:
-        """As of :class:`Smoother`."""
+        """See :meth:`Smoother.link`."""
         return self._smoother.link(before, after)
 
     def smoothed(self, frame: Frame, link: Link, later: Frame) -> Frame:
-        """As of :class:`Smoother`."""
+        """See :meth:`Smoother.smoothed`."""
         return self._smoother.smoothed(frame, link, later)
 
     def results_of(self, frame: Frame) -> tuple[Skeleton, ModelEstimate]:
-        """As :attr:`filtered` and :attr:`estimate`."""
+        """:attr:`filtered` and :attr:`estimate` of a frame."""
         state, skeleton = self._smoother.state_of(frame), frame.skeleton
         estimate = self._output.estimate(state, skeleton.frame_id, skeleton.body)
         return self._output.skeleton(state, skeleton), estimate
@@ -337,7 +337,7 @@ class ExtendedKalmanFilter:
             self._late.clear()
             started = self._poses.first_state(measurement, state)
             if started is None:
-                return False  # what is known of person and sensors stays for the first frame that shows a trunk
+                return False  # keep the estimates of person and sensors until a frame shows a trunk
             self._state = started
         elif self._is_known(measurement, state, last):
             self.counters["repeated_stamps"] += 1
@@ -363,7 +363,7 @@ class ExtendedKalmanFilter:
         )
 
     def _orientation_in_time(self, measurement: SegmentOrientation, state: State) -> bool:
-        """Whether to take an orientation. What one source says of the time resets nothing that cameras see."""
+        """Whether to take an orientation. Its stamp never resets a state that skeletons have started."""
         p = self.parameters
         elapsed = (measurement.stamp_ns - state.stamp_ns) / NANOSECONDS
         alone = state.unplaced and (elapsed > p.predict_for or elapsed < -max(1.0, 2.0 * p.late_window))
@@ -390,7 +390,7 @@ class ExtendedKalmanFilter:
         return True
 
     def _begun_turned(self, measurement: SegmentOrientation) -> bool:
-        """Start the body by orientations alone, where no skeleton comes for some time."""
+        """Start the body by orientations alone if no skeleton has come for some time; whether it was started."""
         since, stamp_ns = self._turned_since, measurement.stamp_ns
         if since is None or abs(stamp_ns - since) > _START_AFTER_NS + NANOSECONDS:
             self._turned_only, since = {}, stamp_ns
@@ -414,7 +414,7 @@ class ExtendedKalmanFilter:
         return True
 
     def _placed(self, measurement: Measurement) -> bool:
-        """Start anew by skeletons what orientations alone had started."""
+        """Restart with skeletons a body that orientations alone had started; whether it was restarted."""
         self._history.clear()
         self._late.clear()
         began = self._begun(measurement)
@@ -428,7 +428,7 @@ class ExtendedKalmanFilter:
 
     @property
     def _state(self) -> State | None:
-        """After all frames, the late ones in their places; None before a start."""
+        """The state after all measurements, late ones included; None before the start."""
         if self._late and self._last is not None:
             self._last = self._replay(self._last)
         return self._last
@@ -438,19 +438,19 @@ class ExtendedKalmanFilter:
         self._last = state
 
     def _is_late(self, measurement: Measurement | SegmentOrientation, state: State) -> bool:
-        """Whether it belongs before what was taken already."""
+        """Whether a measurement precedes one that was processed already."""
         if measurement.stamp_ns < state.stamp_ns:
             return True
         return bool(self._history) and _order(self._history[-1][1]) > _order(measurement)
 
     def _is_awaited(self, measurement: Measurement) -> bool:
-        """Whether orientations of later times wait to be taken, before which it has its place."""
+        """Whether queued orientations are to be processed after this frame."""
         return any(
             isinstance(each, SegmentOrientation) and each.stamp_ns >= measurement.stamp_ns for each in self._late
         )
 
     def _remember(self, state: State, measurement: Measurement | SegmentOrientation) -> State:
-        """Take a frame in its order, and keep what a later, older one would have to be put before."""
+        """Process a measurement, and keep it with the state before it, for a replay with late measurements."""
         horizon = measurement.stamp_ns - self.parameters.late_window * NANOSECONDS
         while self._history and self._history[0][1].stamp_ns < horizon:
             self._history.popleft()
@@ -458,17 +458,16 @@ class ExtendedKalmanFilter:
         return self._step(state, measurement)
 
     def _replay(self, state: State, until_ns: int | None = None) -> State:
-        """Go back to before the first late frame, and take all late and all later ones in their order.
+        """Go back to the state before the first late measurement, and process it and all later ones in order.
 
-        A connection that stalls delivers many at once: to go back for each of them would cost the later ones so many
-        times.
+        A connection that stalls delivers many measurements at once: one replay serves them all.
 
         Args:
-            state: the last one.
-            until_ns: leave what is of a later time; None for nothing.
+            state: the latest one.
+            until_ns: measurements after this time stay queued; None to process all.
         """
         oldest_ns = self._history[0][0].stamp_ns if self._history else state.stamp_ns
-        late = [each for each in self._late if each.stamp_ns >= oldest_ns]  # others are older than all remembered ones
+        late = [each for each in self._late if each.stamp_ns >= oldest_ns]  # others are older than the history
         self._late = []
         if until_ns is not None:
             self._late = [each for each in late if each.stamp_ns > until_ns]
@@ -481,7 +480,7 @@ class ExtendedKalmanFilter:
             state, measurement = self._history.pop()
             again.append(measurement)
         self.counters["taken_again"] += len(again)
-        # of frames of one stamp the late ones come last
+        # the sort is stable: of frames with the same stamp, late ones come last
         for measurement in sorted(again[::-1] + late, key=_order):
             state = self._remember(state, measurement)
         return state
@@ -497,7 +496,7 @@ class ExtendedKalmanFilter:
                 return anew.but(sensors=state.sensors, unplaced=state.unplaced)
         from_ns = self._lengths_from_ns
         if from_ns is not None and state.stamp_ns < from_ns <= measurement.stamp_ns and state.seen is not None:
-            # lengths between joints that are elsewhere now
+            # a T-pose has corrected the joint centres: the lengths measured before it are void
             state = state.but(seen=SegmentLengths(self.parameters.slow_time))
         state = self._motion.predicted(state, measurement.stamp_ns)
         if state.sources.names:
@@ -508,7 +507,7 @@ class ExtendedKalmanFilter:
         try:
             return self._skeletons.taken(state, measurement)
         except np.linalg.LinAlgError:
-            # Rounding, or numbers beyond all measure, have made of the covariance what is none: nothing of it is kept.
+            # Rounding, or absurd input, has made the covariance indefinite: discard it.
             self.counters["broken_covariances"] += 1
             learnt = state.sensors
             unseen = np.full(self._space.points, np.inf)
@@ -517,7 +516,7 @@ class ExtendedKalmanFilter:
             ).but(sensors=learnt)
 
     def _begun(self, measurement: Measurement) -> State | None:
-        """The state after the first frames, enough for an estimate of a sensor's noise."""
+        """The state after the first frames; None until one sensor has enough of them for an estimate of its noise."""
         if self._waiting and abs(measurement.stamp_ns - self._waiting[-1].stamp_ns) > _WAIT_NS:
             self._waiting.clear()
         if any((each.sensor, each.stamp_ns) == (measurement.sensor, measurement.stamp_ns) for each in self._waiting):
@@ -534,7 +533,7 @@ class ExtendedKalmanFilter:
             known = self._sensors.seen_by(known, each, each.measured)
             slow = max(known.slow, self._sensors.least_slow(known.white, each))
             sensors[each.sensor] = known.but(slow=slow)
-        # only the noise is kept: the frames themselves are still to come
+        # keep the noise only: the frames themselves are processed below
         learnt = {name: sensor.but(stamps=(), positions=sensor.positions[:0]) for name, sensor in sensors.items()}
         first, *others = self._waiting
         self._waiting = []
@@ -549,18 +548,18 @@ class ExtendedKalmanFilter:
         return 0 if self._newest is None else self._newest.body
 
     def _empty(self, stamp_ns: int) -> Skeleton:
-        """A frame that shows nothing."""
+        """A frame without any tracked joint."""
         nowhere, unseen = np.full((N_JOINTS, 3), np.nan), np.zeros(N_JOINTS, dtype=np.uint8)
         return Skeleton(stamp_ns, self._frame_id, nowhere, unseen, self._body())
 
 
 def _order(measurement: Measurement | SegmentOrientation) -> tuple[int, str]:
-    """Where it belongs among others: by its time; of the same time, frames come before orientations."""
+    """Sort key: the stamp; with the same stamp, frames come before orientations."""
     return measurement.stamp_ns, measurement.source if isinstance(measurement, SegmentOrientation) else ""
 
 
 def prepare() -> None:
-    """Compile all that a frame needs, or load what is kept of that: some frames of a person who stands still."""
+    """Compile all functions for frames, or load them from the cache, by filtering frames of a person standing still."""
     estimator = ExtendedKalmanFilter()
     positions = np.full((N_JOINTS, 3), np.nan)
     model = estimator.model
@@ -571,4 +570,4 @@ def prepare() -> None:
         stamp_ns = number * NANOSECONDS // 30
         estimator.take(Skeleton(stamp_ns, "", positions, states, covariances=covariances))
     assert estimator.filtered is not None
-    forward_substituted(np.eye(3), whitening_of(np.eye(3)))  # which orientations and the smoother call by themselves
+    forward_substituted(np.eye(3), whitening_of(np.eye(3)))  # orientations and the smoother call them directly

@@ -1,4 +1,4 @@
-"""Compiled parts of the extended filter: what takes the time of a frame."""
+"""Compiled kernels of the extended filter: its most expensive steps."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from body_tracking.kinematics.compiled_body import Tree, curved, integrated, lin
 from body_tracking.kinematics.compiled_posture import PriorTable, prior_rows
 
 _SUDDEN, _SUDDEN_TIME = 20.0, 0.05
-"""m/s2 that a joint may be accelerated by beyond expectation (standard deviation), and the longest time for which."""
+"""m/s2: standard deviation of a sudden acceleration of a joint, beyond the motion model; s: its greatest duration."""
 _FIRST_LIMB = 6
 """Segment whose origin is the first shoulder; then the other, both elbows, both wrists."""
 _TANGENT, _VELOCITIES = 32, 53
@@ -28,20 +28,20 @@ def upright(
     table: PriorTable,
     updates: int,
 ) -> FloatArray:
-    """The update by the posture prior, iterated; changes the covariance in place, velocities are only considered.
+    """The iterated update by the posture prior; changes the covariance in place, velocities are only considered.
 
     Args:
         q: (35,) configuration.
         lengths: (21,) metres.
         covariance: (85, 85) of tangent, lengths and velocities.
         chosen: (k,) rows of :func:`prior_rows`.
-        variance: (k,) of these.
+        variance: (k,) of these rows.
         tree: of the model.
         table: of the prior.
-        updates: how many times it is linearised.
+        updates: number of linearisations.
 
     Returns:
-        (35,) the configuration after it.
+        (35,) the updated configuration.
     """
     size, count = tree.axes.shape[0], len(chosen)
     known = len(covariance) - size
@@ -77,7 +77,7 @@ def upright(
 
 @compiled
 def displacing(observation: FloatArray, weights: FloatArray, information: FloatArray) -> FloatArray:
-    """(53, 57) by how much a pose is off when points are: G = (H^T W H + P^-1)^-1 H^T W.
+    """(53, 57) change of the best-fitting pose by errors of the points: G = (H^T W H + P^-1)^-1 H^T W.
 
     Args:
         observation: (57, 53) H.
@@ -106,7 +106,7 @@ def displacing(observation: FloatArray, weights: FloatArray, information: FloatA
 
 @compiled
 def point_covariances(observation: FloatArray, covariance: FloatArray) -> FloatArray:
-    """(19, 3, 3) covariance of each point, of (57, 53) derivatives and the covariance (53, 53) by which they vary."""
+    """(19, 3, 3) covariance of each point, from its (57, 53) derivatives and the covariance (53, 53) of the pose."""
     half = np.dot(observation, covariance)
     count, size = len(observation) // 3, observation.shape[1]
     result = np.empty((count, 3, 3))
@@ -136,28 +136,28 @@ def expected(
     turns: FloatArray,
     tree: Tree,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """A frame against its prediction.
+    """The predicted measurement of a frame, its innovation and their covariances.
 
     Args:
-        q: (35,) configuration about which it is linearised.
+        q: (35,) configuration at which to linearise.
         lengths: (21,) metres.
-        positions: (19, 3) measured points.
+        positions: (19, 3) metres: measured points.
         covariance: (n, n) of the state.
-        spread: (32, 32) covariance of the tangent, for what curvature adds.
+        spread: (32, 32) covariance of the tangent, for the second-order terms.
         crosses: (n, m) covariance of the state with the slow errors of all sensors.
-        place: first column of this sensor's.
-        own: (19,) deviation of the slow errors of points.
-        along: (4,) relative deviation of the length of each limb, as it is seen; 0 for none.
+        place: first column of this sensor's slow errors.
+        own: (19,) metres: standard deviation of the points' slow errors.
+        along: (4,) standard deviation of each limb's measured length, as a share of the length; 0 for none.
         carried: (19, 4) which points each limb carries.
-        white: (19,) variance of the white noise.
-        turns: (3, 3, 3) derivatives of the free rotations' tangents at the configuration by those of the state; (0, 3,
-            3) where both are the same.
+        white: (19,) square metres: variance of the white noise.
+        turns: (3, 3, 3) derivatives of the free rotations' tangents at ``q`` by those at the state; (0, 3, 3) if ``q``
+            is the state's.
         tree: of the model; the limbs' ends are the origins of segments 6 to 11.
 
     Returns:
         (57, 53) derivative of the points, (57,) innovation, (57, 57) its covariance, (n, 57) covariance of the state
-        with the innovation, (19, 3, 3) blocks of single points with what curvature adds, (57, 4) displacement by limbs
-        that are too long or too short.
+        with the innovation, (19, 3, 3) innovation covariance of each point with the second-order terms, (57, 4)
+        displacement by one standard deviation of each limb's length.
     """
     points, _, axes, observation, _ = linearised(q, lengths, tree)
     count, known = len(points), observation.shape[1]
@@ -204,7 +204,7 @@ def expected(
     for point in range(count):
         for i in range(3):
             for j in range(3):
-                # a normal error x makes x^2 / 2 of mean m and of variance 2 m^2
+                # for a normal error x, x^2 / 2 with the mean m has the variance 2 m^2
                 blocks[point, i, j] = s[3 * point + i, 3 * point + j] + 2.0 * curvature[point, i] * curvature[point, j]
     return observation, innovation, s, cross, blocks, limbs
 
@@ -213,19 +213,19 @@ def expected(
 def solved(
     s: FloatArray, blocks: FloatArray, cross: FloatArray, innovation: FloatArray, covariance: FloatArray, rows: IntArray
 ) -> tuple[bool, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """The Kalman update by some of the rows.
+    """The Kalman update by selected rows of the innovation.
 
     Args:
         s: (57, 57) covariance of the innovation.
-        blocks: (19, 3, 3) those of single points, instead of what it has there.
-        cross: (n, 57) covariance of the state with the innovation.
-        innovation: (57,).
+        blocks: (19, 3, 3) covariance of each point, which replaces the diagonal blocks of ``s``.
+        cross: (n, 57) C, covariance of the state with the innovation.
+        innovation: (57,) metres.
         covariance: (n, n) of the state.
-        rows: (k,) those that are used, ascending.
+        rows: (k,) the selected rows, ascending.
 
     Returns:
         Whether s is positive definite; (k, k) W, the inverse of its lower Cholesky factor; (k, n) W C^T; (k,) the
-        normalised innovation; (n, n) the covariance after it.
+        normalised innovation; (n, n) the updated covariance.
     """
     count, size = len(rows), len(cross)
     factor, whitening = np.empty((count, count)), np.empty((count, count))
@@ -256,16 +256,16 @@ def crosses_updated(
     own: FloatArray,
     limbs: FloatArray,
 ) -> SingleArray:
-    """(n, m) covariance of the state with considered slow errors (Schmidt 1966): C - K H C, and - K B of the sensor's.
+    """(n, m) covariance of the state with considered slow errors (Schmidt 1966): C - K H C, - K B for this sensor's.
 
     Args:
-        crosses: (n, m) before.
+        crosses: (n, m) C, before the update.
         kalman: (n, k) gain.
         observation: (57, 53) derivative of the points.
-        rows: (k,) of it that were used.
-        place: first column of the sensor's own slow errors.
-        own: (19,) deviation of the slow errors of points.
-        limbs: (57, 4) displacement by those of limbs.
+        rows: (k,) rows of ``observation`` that were used.
+        place: first column of this sensor's slow errors.
+        own: (19,) metres: standard deviation of the points' slow errors.
+        limbs: (57, 4) displacement by one standard deviation of each limb's length.
     """
     known, size = observation.shape[1], len(observation)
     seen = np.dot(kalman, observation[rows]).astype(np.float32)
@@ -293,15 +293,15 @@ def pseudo_measured(
 
     Args:
         covariance: (n, n) of the state.
-        crosses: (n, m) with the slow errors of cameras.
-        free: (n, n) of it what may be corrected.
-        free_crosses: (n, m) likewise.
-        rows: (k, 32) what is measured.
-        error: (k,) of it.
-        noise: (k,) variances.
+        crosses: (n, m) covariance of the state with the slow errors of cameras.
+        free: (n, n) the part of ``covariance`` that may be corrected.
+        free_crosses: (n, m) the same part of ``crosses``.
+        rows: (k, 32) observation matrix.
+        error: (k,) innovation.
+        noise: (k,) variances of the pseudo-measurements.
 
     Returns:
-        Whether it is sound, the correction (n,), and both covariances after it.
+        Whether the innovation covariance is positive definite, the correction (n,), and both updated covariances.
     """
     count = len(rows)
     half = np.dot(rows, free[:_TANGENT])
@@ -325,13 +325,13 @@ def pseudo_measured(
 def gated(
     innovation: FloatArray, blocks: FloatArray, measured: BoolArray, rejected_for: FloatArray, dt: float, gate: float
 ) -> tuple[BoolArray, FloatArray]:
-    """The gate of each point.
+    """Gate each point by the Mahalanobis distance of its innovation.
 
     Args:
         innovation: (57,) metres.
-        blocks: (19, 3, 3) covariance of each point.
-        measured: (19,) which points are.
-        rejected_for: (19,) seconds before this frame.
+        blocks: (19, 3, 3) innovation covariance of each point.
+        measured: (19,) which points are measured.
+        rejected_for: (19,) seconds for which each point has been rejected, before this frame.
         dt: seconds since the sensor's last frame.
         gate: greatest squared distance.
 
@@ -339,7 +339,7 @@ def gated(
         (19,) which points are used, and the new ``rejected_for``.
     """
     used, rejected_for = measured.copy(), rejected_for.copy()
-    # a limb may set off faster than it is expected to: what it can do in the time that passed is no outlier
+    # a limb may accelerate more than the motion model expects: its displacement since the last frame is no outlier
     sudden = (0.5 * _SUDDEN * min(dt, _SUDDEN_TIME) ** 2) ** 2
     for k in range(len(measured)):
         if measured[k]:
@@ -350,14 +350,14 @@ def gated(
 
 @compiled
 def carry(part: FloatArray | SingleArray, turns: FloatArray, balls: IntArray, reach: float, fade: float) -> None:
-    """Multiply rows (85 or more, n) by the transition of the motion model from the left, in place.
+    """Multiply rows (85 or more, n) from the left by the transition matrix of the motion model, in place.
 
     Args:
         part: rows of tangent (32), lengths, velocities (32) and more.
         turns: (3, 3, 3) rotations of the tangents of free rotations.
-        balls: (3,) where the tangent has these.
-        reach: seconds of velocity by which positions move.
-        fade: share of the velocities that is left.
+        balls: (3,) index of each free rotation's first coordinate in the tangent.
+        reach: seconds: displacement per unit of velocity.
+        fade: decay factor of the velocities.
     """
     for k in range(len(balls)):
         ball = balls[k]
@@ -386,13 +386,13 @@ def transported(
 
     Args:
         covariance: (n, n) of tangent (32), lengths, velocities (32) up to 85, and sources.
-        crosses: (n, m) with slow errors.
+        crosses: (n, m) covariance of the state with the slow errors.
         turns: (3, 3, 3) rotations of the tangents of free rotations.
-        balls: (3,) where the tangent has these.
-        reach: seconds of velocity by which positions move.
-        fade: what is left of velocities.
-        kept: what is left of slow errors.
-        noise: (3, 32) variances that are added: of tangent, of velocities, and their covariance.
+        balls: (3,) index of each free rotation's first coordinate in the tangent.
+        reach: seconds: displacement per unit of velocity.
+        fade: decay factor of the velocities.
+        kept: decay factor of the slow errors.
+        noise: (3, 32) process noise: variances of tangent and of velocities, and their covariance.
     """
     p = covariance.copy()
     c = crosses * np.float32(kept)

@@ -16,10 +16,10 @@ from body_tracking.filters.ekf.state import State, StateSpace
 _SIDES, _ARM = ("left", "right"), ("shoulder", "elbow", "forearm", "wrist")
 _OF_SPEED = 16.0
 """1/s: with orientations, additional density of a joint's acceleration per square of its speed. A limb swung twice a
-second has 4 pi times its speed as acceleration for about a tenth of a second; with too small a density the lag would be
+second accelerates by 4 pi times its speed for about a tenth of a second; with too small a density the lag would be
 attributed to errors of the sources."""
 _DOUBT_TIME = 0.65
-"""Seconds for which frames that contradict the state are remembered: one errs as those shortly before."""
+"""Seconds: decay time of the evidence of frames that contradict the state; successive frames share their errors."""
 _DENSITY = {
     "base_level": 1.0,
     "base_height": 1.0,
@@ -32,7 +32,7 @@ _DENSITY = {
 People walk and turn at once, and hardly rise or tilt; neck and clavicles move as the spine; arm: shoulder to wrist."""
 _BESIDE_ORIENTATIONS = 50.0
 """rad2/s3: least density of the joints that turn a segment whose orientation is measured. Orientations are quick and
-need no smoothing; what a pose is too slow to follow would be taken for errors of their sources."""
+need no smoothing; the lag of a smoothed pose would be attributed to errors of their sources."""
 
 
 class Motion:
@@ -52,7 +52,7 @@ class Motion:
         self._swift[:, :6] = False
 
     def predicted(self, state: State, stamp_ns: int) -> State:
-        """The motion model over the time that passed (integrated Ornstein-Uhlenbeck velocity)."""
+        """A state predicted to a time by the motion model (integrated Ornstein-Uhlenbeck velocity)."""
         space = self._space
         dt = (stamp_ns - state.stamp_ns) / NANOSECONDS
         if dt <= 0.0:
@@ -110,7 +110,7 @@ class Motion:
         carry(part, self._turns(reach * state.velocity), self._balls, reach, fade)
 
     def _faded(self, dt: float) -> tuple[float, float]:
-        """Share of a velocity after a time, and by how many seconds of it the position moves."""
+        """Decay factor of a velocity over ``dt`` seconds, and displacement per unit of velocity, in seconds."""
         fade = math.exp(-dt / self._parameters.velocity_time)
         return fade, self._parameters.velocity_time * (1.0 - fade)
 
@@ -119,7 +119,7 @@ class Motion:
         return so3.quat_to_matrix(so3.exp(-step[self._model.ball_v]))
 
     def _densities(self) -> tuple[FloatArray, FloatArray]:
-        """(32, 32) which coordinates are of the same joint, and (32,) the density of each."""
+        """(32, 32) 1 for two coordinates of the same joint, else 0, and (32,) the density of each."""
         joints: list[str] = []
         densities: list[float] = []
         for name in self._model.coordinate_names:
@@ -132,7 +132,7 @@ class Motion:
         return same, np.array(densities)
 
     def _quick_table(self) -> BoolArray:
-        """(12, 32) of each segment the coordinates that turn it quickly: those of its limb, of the trunk all."""
+        """(12, 32) which coordinates turn a segment quickly: those of its limb, or all that turn it for the trunk."""
         names = self._model.coordinate_names
         found = np.zeros((len(self._model.segment_names), len(names)), dtype=np.bool_)
         for number, segment in enumerate(self._model.segment_names):

@@ -1,4 +1,4 @@
-"""Updates by orientations of segments, and of the errors of their sources."""
+"""Updates of the state, and of the errors of the sources, by measured orientations of segments."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from body_tracking.filters.ekf.sources import ORIENTATION_NOISE, PER_SOURCE, abo
 from body_tracking.filters.ekf.state import Measurement, State, StateSpace, single
 
 _AHEAD_OF = 0.8
-"""Share of the period of the greatest rate from which on the next orientation counts: clocks jitter."""
+"""Least time between two orientations of a source, as a share of the period of the greatest rate: clocks jitter."""
 _TOGETHER_NS = NANOSECONDS // 125
-"""An orientation so soon after the state is compared with where that is heading for: it saves a prediction, and what
-the motion model adds in the meantime (1 mrad) comes with the next one."""
+"""An orientation this soon after the state is compared with the extrapolated pose. That saves a prediction; the process
+noise of the interval (1 mrad) is added with the next one."""
 _FORGET_AFTER_NS = 30 * NANOSECONDS
 """A source that is silent for longer is forgotten."""
 _RATE_FACTOR = 3.0
-"""Angular velocities err by so many times what is stated, because they do so alike all the time."""
+"""Factor on the stated standard deviation of angular velocities: their errors are not white, but persist."""
 _SLIP_AFTER = 0.4
-"""Seconds for which orientations do not fit before their sensor has slipped."""
+"""Seconds of inconsistent orientations after which their sensor counts as slipped."""
 _SLIP_TIME = 0.5
-"""Seconds over which innovations of orientations are summed, to detect a mean."""
+"""Seconds: decay time of the sum of a source's innovations, which detects a nonzero mean."""
 _SLIPPED = 30.0
 """Squared normalised sum that a consistent source does not reach (chi-square with 3 degrees of freedom)."""
 
@@ -59,10 +59,10 @@ class OrientationUpdate:
         self._by_thumbs = self._thumb_table()
 
     def oriented(self, state: State, measurement: SegmentOrientation) -> State:
-        """A state corrected by an orientation, at its time; the same state where it comes too soon.
+        """A state corrected by an orientation, at its time; unchanged if the source's last one is too recent.
 
         Raises:
-            LinAlgError: its covariance is none.
+            LinAlgError: an innovation covariance is not positive definite.
         """
         space = self._space
         p, sources = self._parameters, state.sources
@@ -104,7 +104,7 @@ class OrientationUpdate:
         lean = lean + white * min(1.0, math.sqrt(self._gate / max(distance, 1e-9)))
         leaning += 1.0
         fits = near and float(lean @ lean) < _SLIPPED * leaning
-        passed = min(since, _SLIP_AFTER) if known else 0.0  # of a new one nothing has passed
+        passed = min(since, _SLIP_AFTER) if known else 0.0  # a new source has no earlier orientation
         unfit_for = 0.0 if fits else float(sources.unfit_for[number]) + passed
         if unfit_for > _SLIP_AFTER:
             self._counters["slips"] += 1
@@ -125,13 +125,13 @@ class OrientationUpdate:
         number: int,
         own: slice,
     ) -> tuple[State, FloatArray]:
-        """The Kalman update by an orientation, linearised anew until it is close; and (3,) the normalised innovation.
+        """The Kalman update by an orientation, iterated until it converges, and (3,) the normalised innovation.
 
         Args:
             state: of the orientation's time.
             measurement: the orientation.
             number: of its source.
-            own: the rows of what is known of that.
+            own: rows of the source's states.
         """
         space = self._space
         t, v = space.tangent, space.velocities
@@ -150,7 +150,7 @@ class OrientationUpdate:
             )
             by_tangent, by_source, innovation = seen.by_tangent, seen.by_source, seen.innovation
             if first is not None:
-                for ball in self._model.ball_v:  # in the tangent of the state
+                for ball in self._model.ball_v:  # derivatives by the tangent at the state
                     by_tangent[:, ball] = by_tangent[:, ball] @ so3.right_jacobian(correction[ball])
                 step = correction[t] + ahead * correction[v]
                 innovation = innovation + by_tangent @ step + by_source @ correction[own]
@@ -192,10 +192,10 @@ class OrientationUpdate:
         return space.moved(state.but(covariance=covariance, crosses=crosses), correction), first
 
     def _spun_by(self, state: State, measurement: SegmentOrientation, number: int, own: slice) -> State:
-        """The velocities corrected by the angular velocity that comes with an orientation; nothing else is.
+        """A state whose velocities alone are corrected by the angular velocity that comes with an orientation.
 
-        What it errs by (how the source sits, axes that are the person's own) it errs by alike all the time, and would
-        teach the pose and its sources what is not so: these are considered but not corrected (Schmidt 1966).
+        Its errors (mounting of the source, axes of the person's joints) persist and would bias the pose and the
+        sources' states: these are considered but not corrected (Schmidt 1966).
         """
         rate = measurement.angular_velocity
         if rate is None:
@@ -203,7 +203,7 @@ class OrientationUpdate:
         v = self._space.velocities
         rotation, turning = self._model.turning(state.q, int(state.sources.segments[number]))
         innovation = rotation @ (state.sources.misalignment[number] @ rate) - turning @ state.velocity
-        # about axes that are off by a misalignment that is known only so well
+        # the axes of the rate err by the misalignment of the source
         misaligned = float(state.covariance.diagonal()[own][:3].mean())
         cross = turning @ state.covariance[v]
         s = cross[:, v] @ turning.T
@@ -213,7 +213,7 @@ class OrientationUpdate:
         if float(white @ white) > self._gate:
             self._counters["rates_rejected"] += 1  # a blow, or the pose is far off
             return state
-        half = whitening @ cross  # of it the columns of velocities are the gain's
+        half = whitening @ cross
         gain = half[:, v]
         taken = gain.T @ half
         covariance = state.covariance.copy()
@@ -238,10 +238,10 @@ class OrientationUpdate:
         covariance[old:, old:] = added
         none = np.zeros((PER_SOURCE, state.crosses.shape[1]), dtype=state.crosses.dtype)
         crosses = np.concatenate([state.crosses, none])
-        # the updates by thumbs so far had too much weight
+        # earlier updates by thumbs had too much weight
         doubtful = self._by_thumbs[sources.segments[-1]]
         covariance[doubtful, doubtful] += self._ranges.stddev[doubtful - 6] ** 2
-        # what was unobserved may be so no longer
+        # unobserved directions may be observed now
         null = np.empty((0, self._space.nv))
         return state.but(sources=sources, covariance=covariance, crosses=crosses, null=null)
 
@@ -263,8 +263,8 @@ class OrientationUpdate:
         which the source's states vary with it.
 
         Returns:
-            (n, 85 and more) combinations, and (85 and more, n) what takes them from a correction; None where there are
-            none.
+            (n, 85 or more) combinations C, and (85 or more, n) directions D, so that a correction x without them is
+            x - D C x; None without any.
         """
         space = self._space
         hidden = np.flatnonzero(space.thumbs[state.sources.segments].any(axis=1))
@@ -281,7 +281,7 @@ class OrientationUpdate:
         return combinations, back
 
     def _forgotten(self, state: State, kept: BoolArray) -> State:
-        """A state with some (n,) of its sources of orientations."""
+        """A state with only the ``kept`` (n,) of its sources of orientations."""
         rows = np.concatenate([np.ones(self._space.size, dtype=np.bool_), np.repeat(kept, PER_SOURCE)])
         return state.but(
             sources=state.sources.kept(kept),
@@ -290,7 +290,7 @@ class OrientationUpdate:
         )
 
     def _thumb_table(self) -> list[IntArray]:
-        """(12,) of each segment the coordinates that rest on its thumb."""
+        """(12,) for each segment, the coordinates that its thumb observes."""
         coordinates = [np.empty(0, dtype=np.intp) for _ in self._model.segment_names]
         for number in np.flatnonzero(self._space.thumbs.any(axis=1)).tolist():
             side = self._model.segment_names[number].rsplit("_", 1)[1]

@@ -44,11 +44,11 @@ class Output:
         self._last_handed_out = None
 
     def _handed_out(self, state: State) -> tuple[FloatArray, FloatArray]:
-        """The configuration to hand out, and its covariance (85, 85) with lengths and velocities.
+        """(35,) configuration for the output, and its covariance (85, 85) with lengths and velocities.
 
-        The filter follows the joints where sensors take them to be. What it cannot know, how far these are from the
-        anatomical ones, is added here; and of both together posture decides (``kinematics.posture``): an iterated
-        update by the prior, once for each output and never fed back. It turns no segment whose orientation is measured.
+        The filter tracks the joint centres as the sensors see them. The covariance of their unknown offsets from the
+        anatomical ones is added here. Then follows an iterated update by the posture prior (``kinematics.posture``),
+        once for each output and never fed back. It turns no segment whose orientation is measured.
         """
         space = self._space
         if self._last_handed_out is None or self._last_handed_out[0] is not state:
@@ -68,7 +68,7 @@ class Output:
         return self._last_handed_out[1:]
 
     def _upright(self, q: FloatArray, lengths: FloatArray, covariance: FloatArray) -> FloatArray:
-        """A configuration after the posture prior; changes its covariance in place, velocities are only considered."""
+        """(35,) configuration after the update by the posture prior; changes its covariance (85, 85) in place."""
         return kernels.upright(
             q,
             lengths,
@@ -81,7 +81,7 @@ class Output:
         )
 
     def _middled(self, q: FloatArray, covariance: FloatArray) -> FloatArray:
-        """(35,) a configuration with covariance (32, 32), updated by the middle of the ranges where vague."""
+        """(35,) configuration, updated by the middle of the ranges of vague twists; its covariance is (32, 32)."""
         soft = self._ranges.soft_coordinates(q)
         gradients = np.zeros((self._space.nv - 6, self._space.nv))
         gradients[:, 6:] = soft.gradients
@@ -98,8 +98,8 @@ class Output:
 
         Args:
             state: of the filter.
-            frame_id: in which the base is.
-            body: whose it is.
+            frame_id: of the base.
+            body: number of the person.
         """
         space = self._space
         q, known = self._handed_out(state)
@@ -115,7 +115,10 @@ class Output:
         )
 
     def skeleton(self, state: State, skeleton: Skeleton) -> Skeleton:
-        """The modelled joints, as of a frame; INFERRED where predicted, NOT_TRACKED where not modelled."""
+        """The modelled joints, with frame, body and tracking states of a skeleton.
+
+        A joint is INFERRED where predicted, NOT_TRACKED where not modelled.
+        """
         space = self._space
         q, covariance = self._handed_out(state)
         lines = self._model.linearised(q, state.lengths)

@@ -69,5 +69,5 @@ class EkfParameters(OrientationParameters):
 
     @property
     def gate(self) -> float:
-        """The squared Mahalanobis distance of three numbers from which on they are rejected."""
+        """Squared Mahalanobis distance (3 degrees of freedom) from which on a measurement is rejected."""
         return chi_square.gate(3, 1.0 - self.gate_probability)

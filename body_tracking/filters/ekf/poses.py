@@ -1,4 +1,4 @@
-"""Poses by inverse kinematics: the initial one, and another one when the filter has a wrong one."""
+"""Poses by inverse kinematics: the initial one, and another one if the filter's is wrong."""
 
 from __future__ import annotations
 
@@ -18,16 +18,17 @@ from body_tracking.kinematics.lengths import SegmentLengths
 _REST_NS = NANOSECONDS // 4
 """Least time between searches for another pose."""
 _MISFIT = 0.02
-"""Metres: persistent distance of a person's points from any pose of the model."""
+"""Metres: standard deviation of a person's points from the best-fitting pose of the model."""
 _WHOLE = 15
 """Least number of points of a frame for an estimate of a person's size."""
 _MUCH_BETTER = 0.5
+"""Greatest cost of a new pose, as a share of the present one's."""
 _FIRST_SPEED, _FIRST_TURN_RATE = 0.3, 1.0
 """m/s and rad/s: standard deviation of the velocities of a person who is first seen."""
 _CONTRADICTION = 0.8
 """Greatest change in radians of a segment with a measured orientation by a new pose."""
 _ANOTHER_SIZE = 1.2
-"""Ratio of sizes from which a person is another one than before."""
+"""Ratio of sizes beyond which the person is taken for another one."""
 
 
 class PoseSearch:
@@ -41,7 +42,7 @@ class PoseSearch:
 
     Attributes:
         inverse: the inverse kinematics.
-        started_by: sensor and stamp of the frame of the last first pose.
+        started_by: sensor and stamp of the frame that last started a pose.
     """
 
     def __init__(
@@ -91,7 +92,7 @@ class PoseSearch:
         *,
         keep_lengths: bool = True,
     ) -> State:
-        """A state at rest at a pose, as uncertain as a fit to points of this deviation (19,) leaves it."""
+        """A state at rest, with the covariance of a fit to points of these standard deviations (19,), in metres."""
         space = self._space
         lines = self._model.linearised(q, lengths)
         weights = np.where(np.isfinite(stddev), 1.0 / stddev**2, 0.0)
@@ -101,7 +102,7 @@ class PoseSearch:
         information = weighted.T @ by_tangent
         information[np.arange(space.nv), np.arange(space.nv)] += space.rest_information
         tangent = np.linalg.inv(information)
-        # the fit took the lengths for true: their errors are in the pose
+        # the fit assumed exact lengths: their errors propagate to the pose
         from_lengths = -tangent @ (weighted.T @ by_length)
         lengths_covariance = (
             previous.covariance[space.lengths, space.lengths]
@@ -141,14 +142,14 @@ class PoseSearch:
         )
 
     def searched(self, state: State, measurement: Measurement, back: BoolArray) -> State:
-        """A state that a frame has corrected, or another one where that is in a wrong pose.
+        """The given state, or a restarted one if its pose is wrong.
 
         Args:
-            state: after the frame.
+            state: after the update by the frame.
             measurement: the frame.
-            back: (19,) which of its points had been away for long.
+            back: (19,) points that reappear in it after a long absence.
         """
-        # another pose takes ten times as long to look for as a frame to filter
+        # a search takes ten times as long as filtering a frame
         if state.stamp_ns - state.attempted_ns <= _REST_NS:
             return state
         if state.rejected_for.max() > self._parameters.reacquire_after:
@@ -165,13 +166,13 @@ class PoseSearch:
         started = self._restarted(state, points, stddev, _MUCH_BETTER)
         if started is not state or state.settled or int(measurement.measured.sum()) < _WHOLE:
             return started
-        # No pose fits: lengths that came from a wrong start would shut the right points out for ever.
+        # No pose fits: wrong lengths from a wrong start would cause the rejection of right points for ever.
         covariance = state.covariance.copy()
         covariance[space.lengths, space.lengths] += space.lengths_covariance
         return state.but(covariance=covariance)
 
     def _astray(self, state: State, measurement: Measurement, back: BoolArray) -> bool:
-        """Whether an update by points (19,) that were away for long ended where they are not."""
+        """Whether the updated pose misses any of the reappeared points (19,)."""
         off = measurement.positions - self._model.forward(state.q, state.lengths).positions
         variance = self._sensors.point_stddev(measurement, state.sensors) ** 2 + _MISFIT**2
         return bool(((off**2).sum(axis=1) > self._gate * variance)[back].any())
@@ -182,9 +183,9 @@ class PoseSearch:
         return points, self._sensors.point_stddev(measurement, state.sensors)
 
     def _restarted(self, state: State, points: FloatArray, stddev: FloatArray, share: float) -> State:
-        """A pose that fits points with at most a share of the present one's cost; else the present state."""
+        """A state restarted at a pose whose cost is at most a share of the present one's; else the present state."""
         try:
-            # deciding about a pose takes half the steps of computing it
+            # a coarse fit suffices for the decision, and takes half the steps
             fit = self.inverse.solve(points, stddev, state.lengths, tolerance=CLOSE)
             # lengths that were learnt in a wrong pose are wrong, too
             lengths = self._lengths_of(points)
@@ -211,11 +212,11 @@ class PoseSearch:
         return started.but(corrected=self._change(state, started))
 
     def _change(self, before: State, after: State) -> FloatArray:
-        """(53,) ``State.corrected`` of a new pose."""
+        """(53,) change of tangent and lengths, for ``State.corrected``."""
         return np.concatenate([self._model.difference(before.q, after.q), after.lengths - before.lengths])
 
     def _lengths_of(self, points: FloatArray) -> FloatArray:
-        """(21,) average proportions at the size of the person that is seen."""
+        """(21,) metres: average proportions, scaled to the size of the observed person."""
         lengths = self._model.default_lengths()
         neutral = self._model.forward(self._model.neutral(), lengths).positions
         starts, ends = self._bones

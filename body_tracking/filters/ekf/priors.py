@@ -14,7 +14,7 @@ _PRIOR_PERIOD = 0.1
 """Seconds between updates by the ranges of motion."""
 
 _POSTURE_TIME = 1.0
-"""Correlation time of posture in seconds: it counts as one observation per twice that time."""
+"""Seconds: correlation time of posture; the prior counts as one observation per twice this time."""
 VAGUE = 0.5
 """Share of the range's deviation from which an angle is moved to the middle of its range."""
 _SPURIOUS = 0.7
@@ -24,6 +24,7 @@ _NULL = 1e-6
 _LIMIT_STDDEV = 3.0
 """Degrees: standard deviation of the pseudo-measurement at a limit."""
 _HARD_STDDEV = 0.2
+"""Degrees: the same far beyond a limit."""
 _PROJECTIONS = 3
 _FAR_BEYOND, _BACK_TO = np.radians(10.0), np.radians(8.0)
 """An estimate farther beyond a range than the first is brought back to the second."""
@@ -105,9 +106,9 @@ class Priors:
     def _unsure(self, state: State) -> State:
         """Remove spurious information about unobserved directions.
 
-        The unobserved directions are those of the estimate, which trembles; the update takes their turning from
-        frame to frame for information (Huang, Mourikis and Roumeliotis 2010). Along each of them the covariance is
-        brought back to what the ranges of motion say.
+        The unobserved directions depend on the estimate, which is noisy; the update takes their rotation from frame to
+        frame for information (Huang, Mourikis and Roumeliotis 2010). Along each of them the covariance is raised to a
+        share of that of the ranges of motion.
         """
         space = self._space
         lines = self._model.linearised(state.q, state.lengths)
@@ -130,11 +131,11 @@ class Priors:
         return state.but(covariance=covariance)
 
     def _drawn(self, state: State, observation: FloatArray, values: FloatArray, stddev: FloatArray) -> State:
-        """The estimate moved to the middle of the ranges in unobserved directions; the covariance stays.
+        """Move the estimate to the middle of the ranges in unobserved directions; the covariance stays.
 
-        Without this, an angle that nothing observes would wander with the noise of those that are. Beside orientations
-        it is done to what is handed out only (``output``): what cameras pull back again and again, as the
-        covariance stays, would end up in the headings and misalignments of the sources.
+        Otherwise an unobserved angle would wander with the noise of the observed ones. With orientations only the
+        output is moved (``output``): cameras would pull the state back every time, as the covariance stays, and these
+        corrections would accumulate in the headings and misalignments of the sources.
         """
         space = self._space
         cross_covariance = self._free(state)[0][:, space.tangent] @ observation.T
@@ -147,8 +148,8 @@ class Priors:
     def within(self, state: State) -> State:
         """The nearest state, by the covariance, that is not far beyond any range of motion.
 
-        Softly a range pushes back ten times a second; a velocity that runs on while nothing is seen, or a measurement
-        that no body can follow, is stopped here at once.
+        The soft limits act ten times a second; a velocity that continues while nothing is seen, or a measurement that
+        no body can follow, is stopped here at once.
         """
         for _ in range(_PROJECTIONS):
             values = soft_values(state.q, self._space.prior_table)
@@ -177,14 +178,17 @@ class Priors:
         noise: FloatArray,
         part: tuple[FloatArray, SingleArray],
     ) -> State:
-        """The update by pseudo-measurements (k,) of rows (k, 32) of the tangent with variances (k,).
+        """The update by pseudo-measurements of the tangent.
 
         Args:
             state: to be corrected.
-            observation: rows.
-            error: of what is observed.
-            noise: variances.
-            part: the covariance, and with the slow errors of cameras: all of it, or what may be corrected.
+            observation: (k, 32) observation matrix.
+            error: (k,) innovation.
+            noise: (k,) variances.
+            part: of the covariance, and of that with the slow errors of cameras, what may be corrected.
+
+        Raises:
+            LinAlgError: the innovation covariance is not positive definite.
         """
         space = self._space
         sound, correction, covariance, crosses = pseudo_measured(
@@ -209,18 +213,18 @@ class Priors:
         s = observation @ cross_covariance[space.tangent]
         s[np.arange(len(s)), np.arange(len(s))] += np.radians(stddev) ** 2
         correction = -cross_covariance @ np.linalg.solve(s, excess)
-        correction[space.size :] = 0.0  # as the covariance stays, sources would learn this again and again
+        correction[space.size :] = 0.0  # the covariance stays: corrections would accumulate in the sources
         return space.moved(state, correction)
 
     def _free(self, state: State) -> tuple[FloatArray, SingleArray]:
-        """The covariance of all, and with the slow errors of cameras, as far as orientations leave a pose free."""
+        """:meth:`free` of the state's covariance, and of that with the slow errors of cameras."""
         return self.free(state, state.covariance, state.crosses)
 
     def free(self, state: State, covariance: FloatArray, crosses: SingleArray) -> tuple[FloatArray, SingleArray]:
-        """As far as orientations leave a pose free, its covariance (n, n), and that with m others (n, m).
+        """The part of a covariance (n, n), and of that with m other errors (n, m), that orientations leave free.
 
-        Priors turn no segment whose orientation is measured: they have the same error time and again, and the errors
-        of the sources would be corrected instead.
+        Priors must not turn a segment whose orientation is measured: their error is the same every time, and would
+        accumulate in the states of the sources.
         """
         speaking = state.stamp_ns - state.sources.stamps < _HELD_FOR_NS
         if not speaking.any():

@@ -16,7 +16,7 @@ _MEAN = np.full(_DIMENSIONS, 1.0 / _DIMENSIONS)
 _FIRST_WHITE = 0.01
 """Metres: standard deviation of a sensor's white noise before it is learnt."""
 _FLOOR = 1e-3
-"""Metres: no sensor's white noise is taken for less."""
+"""Metres: least standard deviation of a sensor's white noise."""
 _MAX_SLOW = 9.0
 """Greatest scale of the slow variance: three times the model's deviation."""
 _THIRD_DIFFERENCE_SPAN = 0.25
@@ -26,39 +26,38 @@ _CORRELATED = 2.31
 _NOISE_FRAMES = 600.0
 """Frames over which the white noise of a point is averaged."""
 _POOL = 8.0
-"""Frames from which on a point's own noise counts alone."""
+"""Half the number of frames from which on a point's noise is estimated from its own frames alone."""
 _OUTLYING = 6.0
-"""A squared difference counts as at most so many times the variance."""
+"""Bound of a squared difference, as a multiple of the variance."""
 STRETCH = 0.067
-"""Share of the length of an upper arm or forearm that a sensor that states covariances is wrong by: a Kinect v2's vary
-by 6.7 % (root mean square over clips of UI-PRMD)."""
+"""Standard deviation of the length of an upper arm or forearm, as a share of it, by a sensor that states covariances:
+6.7 % for a Kinect v2 (root mean square over clips of UI-PRMD)."""
 _BESIDE_ORIENTATIONS = 3.0
-"""Beside orientations the variance of slow errors is at least this share of what cameras state: what a camera is always
-wrong by alike passes for a body of other proportions as long as nothing but cameras sees it."""
+"""With orientations, least variance of a camera's slow errors as a multiple of the variance that it states: without
+them, its constant errors are explained by a body of other proportions."""
 _ALONE = 0.1
-"""Share of the parameter ``slow_scale`` for a sensor that no other one contradicts: with all of it the population's
-segment lengths outweigh the person's in the first seconds, and elbows err by 10 instead of 6 degrees
-(``benchmarks/kinect_vs_vicon.py``)."""
+"""Factor on the parameter ``slow_scale`` for a single sensor: without it, average segment lengths outweigh the person's
+in the first seconds, and elbows err by 10 instead of 6 degrees (``benchmarks/kinect_vs_vicon.py``)."""
 _LEAST_ERROR = 0.004
-"""Metres: no sensor knows where the centre of a joint is better than this."""
+"""Metres: least standard deviation of a sensor's joint centres, white and slow errors together."""
 _SIGNIFICANT = 2.0
 """Standard deviations above zero from which a scale of slow errors is used."""
 _SLOW_PERIOD_NS = NANOSECONDS // 15
 _SLOW_STEP = 0.02
-"""Share by which a scale changes at least: each change requires a correction of the state."""
+"""Least relative change of a scale: each change requires a correction of the state."""
 _SLOW_MEMORY = 0.7
 """Seconds over which the scale of the slow errors is averaged."""
 
 
 class SensorErrors:
-    """Learns what sensors err by, and says what that does to their points.
+    """Estimates the errors of sensors, and gives the covariances of their points.
 
     Args:
         space: of the states.
         parameters: of the filter.
 
     Attributes:
-        carried: (19, 4) which points hang on each limb.
+        carried: (19, 4) which points each limb carries.
         slow_size: how many slow errors a sensor has (61): three of each point, and one of each limb.
     """
 
@@ -69,11 +68,11 @@ class SensorErrors:
         self.slow_size = 3 * space.points + len(self._limbs)
 
     def unknown(self, measurement: Measurement, alone: bool = False) -> SensorState:
-        """What is taken of a sensor before it is known; slow errors of one that states how much it errs.
+        """The initial errors of a sensor; slow errors only if it states covariances.
 
         Args:
             measurement: its first one.
-            alone: there is no other sensor.
+            alone: whether there is no other sensor.
         """
         space = self._space
         p = self._parameters
@@ -94,7 +93,7 @@ class SensorErrors:
         )
 
     def seen_by(self, sensor: SensorState, measurement: Measurement, used: BoolArray) -> SensorState:
-        """The variance of the white noise, from the third differences of the points that passed the gate."""
+        """Update the variance of the white noise by the third differences of the points that passed the gate."""
         points = np.where(used[:, None], measurement.positions, np.nan)
         stamps, frames = sensor.stamps, sensor.positions
         if len(stamps) == 3 and (measurement.stamp_ns - stamps[0]) / NANOSECONDS < _THIRD_DIFFERENCE_SPAN:
@@ -113,7 +112,7 @@ class SensorErrors:
         early = float(weight.min()) < 2.0 * _POOL
         bound = differences
         if early:
-            # what all points say together keeps one that was not seen yet from any value
+            # bound a point without an estimate of its own by the typical value of all points
             bound = np.maximum(bound, _typical(squared[known], 1.0))
         kept = np.minimum(weight, _NOISE_FRAMES)
         differences = np.where(
@@ -139,14 +138,14 @@ class SensorErrors:
         """One step of maximum likelihood (Fisher scoring) for the scale of the slow variance of points.
 
         Returns:
-            The scale to be used, its estimate and the information of this.
+            The scale to be used, its estimate, and the information of the estimate.
         """
         least = self.least_slow(sensor.white, measurement)
         if oriented and measurement.skeleton.covariances is not None:
             least = max(least, _BESIDE_ORIENTATIONS)
-        # It changes slowly, and takes a while to compute.
+        # The scale changes slowly, and its computation is expensive: 15 times a second are enough.
         soon = sensor.stamps and measurement.stamp_ns // _SLOW_PERIOD_NS == sensor.stamps[-1] // _SLOW_PERIOD_NS
-        # What is white is not known at first, and would be taken for slow.
+        # White noise would be taken for slow errors before its variance is known.
         if soon or sensor.weight.max() < 2.0 * _POOL:
             return _kept(sensor.slow, max(sensor.slow, least)), sensor.slow_estimate, sensor.slow_information
         half = whitening * np.sqrt(measurement.model_variance).repeat(3)[rows]
@@ -155,9 +154,9 @@ class SensorErrors:
         information = 0.5 * float((gram * gram).sum())
         passed = _SLOW_PERIOD_NS / NANOSECONDS
         total = sensor.slow_information * math.exp(-passed / _SLOW_MEMORY) + information
-        # the mean of what each frame says, which may be less than nothing
+        # mean of the frames' estimates, weighted by their information; it may be negative
         estimate = sensor.slow_estimate + (information * (sensor.slow - sensor.slow_estimate) + score) / total
-        # an error is taken for real when it stands out: else every sensor would have a little of it
+        # use only a significant scale: otherwise every sensor would have small slow errors
         real = estimate * math.sqrt(total) > _SIGNIFICANT
         return _kept(sensor.slow, max(min(estimate, _MAX_SLOW) if real else 0.0, least)), estimate, total
 
@@ -167,10 +166,10 @@ class SensorErrors:
         return max(missing, 0.0) / float(measurement.model_variance.sum())
 
     def slow_stddev(self, sensor: SensorState, measurement: Measurement) -> tuple[FloatArray, FloatArray]:
-        """(19,) metres, of the slow errors of points by themselves; (4,) of those of limbs, as a share of their length.
+        """(19,) metres, of the points' own slow errors; (4,) of the limbs' slow errors, as a share of their length.
 
-        The upper arms and forearms are too long or too short in some poses, with all that hangs on them: along a limb a
-        depth sensor finds its joints by a tenth of the length nearer or farther.
+        In some poses a depth sensor measures upper arms and forearms a tenth too long or too short, and displaces all
+        points beyond.
         """
         stretch = STRETCH if sensor.stated else 0.0
         return math.sqrt(sensor.slow) * np.sqrt(measurement.model_variance), np.full(len(self._limbs), stretch)
@@ -202,7 +201,7 @@ def _kept(before: float, after: float) -> float:
 
 
 def _typical(variances: FloatArray, weight: float) -> float:
-    """What several variances say together, each the mean of so many squared third differences, some of outliers."""
+    """Common value of several variances, robust to outliers; each is the mean of ``weight`` squared differences."""
     freedom = _DIMENSIONS * (1.0 + (weight - 1.0) / _CORRELATED)
     # Wilson and Hilferty 1931: the median of chi-square over its mean
     return float(np.median(variances)) / (1.0 - 2.0 / (9.0 * freedom)) ** 3

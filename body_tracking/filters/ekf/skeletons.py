@@ -21,36 +21,36 @@ from body_tracking.filters.ekf.state import Measurement, SensorState, State, Sta
 _TRACKED = np.uint8(TrackingState.TRACKED)
 _EYE3 = np.eye(3)
 _MEAN_VARIANCE = _EYE3.reshape(-1) / 3.0
-"""(9,) factors of a covariance, row by row."""
+"""(9,) weights of a covariance's elements, row by row, that give the mean variance."""
 _FORESEEABLE = 0.1
 """Metres: standard deviation of a predicted point up to which its innovation is used for slow errors."""
 _SETTLE_STDDEV = 0.003
-"""Metres: lengths stay as they are from when they are known as well as this."""
+"""Metres: the lengths are fixed when their standard deviations are below this."""
 _SETTLE_AFTER = 0.3
-"""Share of the settle time before which no length stays: a person has to be seen in more than one pose."""
+"""Share of the settle time before which the lengths are not fixed: a person has to be seen in more than one pose."""
 _AWAY_NS = NANOSECONDS // 4
 """Unseen for longer than this, a limb may have turned farther than a linearisation reaches."""
 _YOUNG = 1.0
-"""Seconds from the start on in which a pose may be far from where a frame is linearised."""
+"""Seconds after the start in which a pose may be far from the point of linearisation."""
 _ENOUGH_BLOCKS = 5
-"""Seconds of frames from which on the lengths are what these say."""
+"""Seconds of frames from which on the lengths are estimated from them."""
 _LENGTHS_PERIOD = 0.75
-"""Seconds that they are left alone for: several sensors' blocks of a second are brought in together."""
+"""Least seconds between updates of the lengths: one update serves the blocks of all sensors, a second each."""
 
 _REACH = 0.8
-"""Metres: no pose that was lost is farther off than an arm is long."""
+"""Metres: bound of a rejected innovation; a wrong pose is off by at most the length of an arm."""
 
 
 class _Expected(NamedTuple):
-    """A frame against what was expected of it.
+    """Predicted measurement of a frame and its innovation.
 
     Attributes:
         observation: (57, 53) derivative of the points by tangent and lengths of the state.
-        innovation: (57,) metres, for a state without any correction.
+        innovation: (57,) metres, referred to the state without any correction.
         covariance: (57, 57) of the innovation.
         cross: (85, 57) covariance of the state with the innovation.
-        own: (19, 3, 3) blocks of single points of the covariance, with what curvature adds.
-        limbs: (57, 4) displacement by the limbs' slow errors.
+        own: (19, 3, 3) innovation covariance of each point, with the second-order terms.
+        limbs: (57, 4) displacement by one standard deviation of each limb's length.
     """
 
     observation: FloatArray
@@ -62,7 +62,7 @@ class _Expected(NamedTuple):
 
 
 class SkeletonUpdate:
-    """Takes frames into a state.
+    """Updates a state by frames.
 
     Args:
         space: of the states.
@@ -75,7 +75,7 @@ class SkeletonUpdate:
 
     Attributes:
         innovation_distance: the last frame's normalised innovation squared over all its accepted points.
-        innovation_dimension: its expectation.
+        innovation_dimension: expectation of this distance.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class SkeletonUpdate:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew: no frame was taken."""
+        """Forget the last frame."""
         self.innovation_distance = math.nan
         self.innovation_dimension = 0
 
@@ -102,7 +102,7 @@ class SkeletonUpdate:
         """A state of the measurement's time, corrected by it.
 
         Raises:
-            LinAlgError: its covariance is none.
+            LinAlgError: an innovation covariance is not positive definite.
         """
         back = measurement.measured & (measurement.stamp_ns - state.used_ns > _AWAY_NS)
         state = self._corrected(state, measurement, bool(back.any()))
@@ -110,12 +110,12 @@ class SkeletonUpdate:
         return self._priors.within(self._priors.bounded(self._measured(state, measurement)))
 
     def _corrected(self, state: State, measurement: Measurement, reappeared: bool) -> State:
-        """The Kalman update with the points that pass the gate; what was learnt of the sensor.
+        """The Kalman update by the points that pass the gate, and the update of the sensor's errors.
 
         Args:
             state: of the measurement's time.
             measurement: the frame.
-            reappeared: a point had been away for long.
+            reappeared: whether a point reappears after a long absence.
         """
         space = self._space
         dt = max(0.0, (measurement.stamp_ns - self._last_stamp(state, measurement)) / NANOSECONDS)
@@ -141,9 +141,9 @@ class SkeletonUpdate:
         rows: IntArray = np.flatnonzero(np.repeat(used, 3))
         predicted_variance = seen.own[used].reshape(count, -1) @ _MEAN_VARIANCE - sensor.white[used]
         correction = np.zeros(len(state.covariance))
-        # Of a person who is followed, cameras alone are as accurate with one linearisation. At the start and after an
-        # absence it would leave an arm turned about itself, and sure of it, which a source's alignment then learns.
-        # Against orientations that are far from a camera's arm a source would be taken for slipped.
+        # With cameras alone one linearisation is as accurate while a person is tracked. At the start and after an
+        # absence it would leave an arm with a wrong axial rotation of small variance, and a source's misalignment would
+        # absorb the error. Where orientations are far from a camera's arm, their source would seem to have slipped.
         far = reappeared or bool(state.sources.names) or state.tracked < _YOUNG
         for left in reversed(range(LINEARISATIONS if far else 1)):
             sound, whitening, gain, white, covariance = solved(
@@ -155,8 +155,8 @@ class SkeletonUpdate:
             turned = np.abs(correction[3 : space.nv]).max()
             if not left or turned < FAR or np.abs(correction - before)[3 : space.nv].max() < CLOSE:
                 break
-            # Far from where it was linearised the measurement says something else: linearise it anew about what was
-            # found (iterated posterior linearisation, Garcia-Fernandez et al. 2015).
+            # The linearisation does not hold that far from the state: linearise anew at the updated estimate (iterated
+            # posterior linearisation, Garcia-Fernandez et al. 2015).
             seen = self._expected(state, measurement, sensor, correction[: space.observed], covariance)
         unlearnt = self._orientations.unlearnt(state) if state.sources.names else None
         if unlearnt is not None:
@@ -164,7 +164,7 @@ class SkeletonUpdate:
             taken = gain @ combinations.T
             correction -= back @ (combinations @ correction)
             covariance += back @ (taken.T @ taken) @ back.T
-        # errors are told in the tangent of what is found
+        # express the covariance in the tangent space at the updated estimate
         turns = [(ball, so3.right_jacobian(correction[ball])) for ball in self._model.ball_v] if turned >= FAR else []
         for ball, turn in turns:
             covariance[ball] = turn @ covariance[ball]
@@ -173,7 +173,7 @@ class SkeletonUpdate:
             correction[space.lengths] = 0.0
             covariance[space.lengths, space.lengths] = state.covariance[space.lengths, space.lengths]
         if len(state.null):
-            # what no point shows must not tremble with those that are seen
+            # keep the unobserved directions from following the noise of the observed ones
             for part in (correction[space.tangent], correction[space.velocities]):
                 part -= (state.null @ part) @ state.null
         self.innovation_distance, self.innovation_dimension = float(white @ white), len(white)
@@ -198,11 +198,11 @@ class SkeletonUpdate:
         foreseeable = float(predicted_variance.max()) < _FORESEEABLE**2
         slow_scale, slow_estimate, information = (
             self._sensors.slow_learnt(sensor, measurement, whitening, white, rows, bool(state.sources.names))
-            if foreseeable  # elsewhere the linearisation errs by more than the sensor
+            if foreseeable  # otherwise the linearisation errs by more than the sensor
             else (sensor.slow, sensor.slow_estimate, sensor.slow_information)
         )
         if slow_scale != sensor.slow and sensor.slow > 0.0:
-            # What the slow errors did to the state so far is as much smaller as they are.
+            # Scale the slow errors' contribution to the covariance by the same ratio.
             ratio = slow_scale / sensor.slow
             own_cross = crosses[:, place : place + 3 * space.points]
             covariance -= (1.0 - ratio) * own_cross @ own_cross.T
@@ -221,7 +221,7 @@ class SkeletonUpdate:
     def _disputed(
         self, state: State, measurement: Measurement, innovation: FloatArray, rejected_for: FloatArray
     ) -> FloatArray:
-        """(57,) ``State.disputed`` after a frame: 0 of accepted points, as before of unseen ones."""
+        """(57,) ``State.disputed`` after a frame: 0 for accepted points, unchanged for unseen ones."""
         share = np.minimum(rejected_for / max(self._parameters.reacquire_after, 1e-3), 1.0)
         disputed = np.sqrt(share).repeat(3) * np.clip(innovation, -_REACH, _REACH)
         return np.where(measurement.measured.repeat(3), disputed, state.disputed)
@@ -234,14 +234,14 @@ class SkeletonUpdate:
         correction: FloatArray | None = None,
         covariance: FloatArray | None = None,
     ) -> _Expected:
-        """What a sensor is expected to measure, linearised about the state or about what a correction makes of it.
+        """The predicted measurement, linearised at the state, or at the state after a correction.
 
         Args:
             state: of the measurement's time.
             measurement: the frame.
-            sensor: its errors.
+            sensor: errors of its sensor.
             correction: (53,) of tangent and lengths; None for none.
-            covariance: (85, 85) after it.
+            covariance: (85, 85) after the correction.
         """
         space, t = self._space, self._space.tangent
         q, lengths, spread = state.q, state.lengths, state.covariance if covariance is None else covariance
@@ -249,7 +249,7 @@ class SkeletonUpdate:
             q = self._model.integrate(q, correction[t])
             lengths = lengths if state.settled else lengths + correction[space.lengths]
         turns = np.zeros((0, 3, 3))
-        if correction is not None:  # in the tangent of the state
+        if correction is not None:  # derivatives by the tangent at the state
             turns = so3.right_jacobian(correction[self._model.ball_v])
         own, along = self._sensors.slow_stddev(sensor, measurement)
         found = _Expected(
@@ -279,7 +279,7 @@ class SkeletonUpdate:
         return sensor.stamps[-1] if sensor is not None and sensor.stamps else measurement.stamp_ns
 
     def _measured(self, state: State, measurement: Measurement) -> State:
-        """Replace the lengths by those estimated from many poses."""
+        """Add a frame to the estimator of the lengths, and replace the lengths by its estimate when it is due."""
         space = self._space
         if state.seen is None:
             return state
@@ -303,7 +303,7 @@ class SkeletonUpdate:
         known = float(np.sqrt(found.covariance.diagonal()).max()) < _SETTLE_STDDEV
         if known and state.tracked > _SETTLE_AFTER * self._parameters.settle_time:
             state = state.but(seen=None)
-        # The lengths' errors are new ones. What is known of the rest where the lengths are given stays as it is.
+        # Replace the marginal distribution of the lengths; that of the rest given the lengths stays.
         before = state.covariance[space.lengths, space.lengths]
         follows: FloatArray = np.asarray(np.linalg.solve(before, state.covariance[space.lengths]).T, dtype=np.float64)
         crosses = state.crosses - single(follows) @ state.crosses[space.lengths]

@@ -5,11 +5,12 @@ averages them out. With ``P_xc`` the covariance of pose and velocities with thes
 
     N = P - P_xc P_cc^-1 P_cx                                                                                 (1)
 
-is the covariance for known c. Gains follow from ``N`` alone, and it alone shrinks (' the next frame, - its prediction):
+is the covariance for known c. Gains follow from ``N`` alone, and only ``N`` shrinks (' marks the next frame, - its
+prediction):
 
     G = N F^T (N-')^-1,    N_s = N + G (N_s' - N-') G^T,    P_s = P + N_s - N.                                (2)
 
-The errors of configurations are taken in the tangents of the prediction and of the smoothed one alike: they are degrees
+The tangent spaces at the prediction and at the smoothed configuration are taken for the same, as both are only degrees
 apart.
 """
 
@@ -26,7 +27,7 @@ from body_tracking.filters.ekf.state import State, StateSpace
 from body_tracking.filters.smoothing import backward_gain, smoothed_covariance
 
 _LEAST_SHARE = 1e-6
-"""Share of each variance that stays where rounding, as the slow errors are in single precision, leaves none."""
+"""Share of each variance that is added against rounding: the slow errors are in single precision."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +37,7 @@ class Frame:
     Attributes:
         state: of the filter.
         skeleton: the sensor's.
-        epoch: changes where a pose is not the continuation of the one before.
+        epoch: changes where the pose is not continuous.
         free: (n, n) N of the filter; n as of :meth:`Smoother.free`.
         smoothed: (n, n) N_s.
     """
@@ -54,7 +55,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Link:
-    """Between two frames: (n, n) gain, and the prediction of the later one with its (n, n) N."""
+    """Relation of two frames: (n, n) gain, and the prediction of the later one with its (n, n) N."""
 
     gain: FloatArray
     prior: State
@@ -80,7 +81,7 @@ class Smoother:
             free = self.free(state)
         except np.linalg.LinAlgError:
             own = self._own(state)
-            free, epoch = state.covariance[np.ix_(own, own)], -state.stamp_ns  # no other one has this epoch
+            free, epoch = state.covariance[np.ix_(own, own)], -state.stamp_ns  # no other frame has this epoch
         return Frame(state, skeleton, epoch, free, free)
 
     def _own(self, state: State) -> IntArray:
@@ -91,7 +92,7 @@ class Smoother:
         """(n, n) N of equation 1.
 
         Raises:
-            LinAlgError: the covariance is none.
+            LinAlgError: the covariance is not positive definite.
         """
         own, crosses = self._own(state), state.crosses.astype(np.float64)
         rest = np.setdiff1d(np.arange(len(state.covariance)), own)

@@ -34,37 +34,38 @@ from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UpperBody
 
 PER_SOURCE: Final = 7
-"""Numbers of the state for each source: misalignment (3), heading, error that persists (3)."""
+"""States of each source: misalignment (3), heading, persistent error (3)."""
 _MISALIGNMENT, _HEADING, _SLOW = slice(0, 3), 3, slice(4, 7)
 TISSUE_TIME = 2.0
-"""Seconds for which errors of moving tissue persist."""
+"""Seconds: correlation time of the errors of moving tissue."""
 MISALIGNMENT_DENSITY, HEADING_DENSITY = 3e-5, 3e-5
-"""rad2/s: of the random walks of misalignment and heading, the latter besides the growth that a source states."""
+"""rad2/s: densities of the random walks of misalignment and heading, the latter beside the growth that a source
+states."""
 ORIENTATION_NOISE = 0.01
 """Radians: white noise per axis of each orientation that is used."""
 _SLIP_STDDEV = 0.35
-"""Radians by which a sensor may have slipped whose orientations do not fit any more."""
+"""Radians: standard deviation of the misalignment, per axis, that a slip adds."""
 _EYE3 = np.eye(3)
 _Z = np.array([0.0, 0.0, 1.0])
 _PARTS = np.array([0, 0, 0, 1])
-"""Of misalignment (3) and heading which of the two variances that are stated."""
+"""Index of the stated variance (misalignment, heading) for each of misalignment (3) and heading."""
 _SAME = 0.02
-"""Share by which a stated variance changes at least."""
+"""Relative change of a stated variance below which it is ignored."""
 _SMALL = 1e-4
 """Radians below which the first terms of a series are exact."""
 
 _WALKS = np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0]), np.diag([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 
 _HEADINGS = 8
-"""Headings of the base from which a pose is looked for."""
+"""Number of initial headings of the base in the search for a pose."""
 _STEPS = 20
 _FARTHEST = 0.5
-"""Radians: no step of the search is longer."""
+"""Radians: greatest step of the search."""
 _CONVERGED = 1e-4
 _FIT_STDDEV = 0.1
-"""Radians of an orientation, where a pose is looked for that fits several."""
+"""Radians: standard deviation of an orientation in the search."""
 _UPRIGHT = 0.3
-"""Radians by which people's pelvises tilt."""
+"""Radians: standard deviation of the tilt of the pelvis in the search."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,20 +101,20 @@ class OrientationParameters:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sources:
-    """What is known of n sources of orientations; never written into.
+    """Estimated errors of n sources of orientations; the arrays are never written into.
 
     Attributes:
-        names: who.
+        names: of the sources.
         segments: (n,) numbers of the segments that they sit on.
         misalignment: (n, 3, 3) M.
         heading: (n,) radians h.
         slow: (n, 3) radians g.
-        slow_variance: (n, 3, 3) rad2, stationary, of g.
-        stated: (n, 2) rad2, of misalignment and heading, as it was stated last.
-        stamps: (n,) nanoseconds, of the last orientation that was looked at.
-        unfit_for: (n,) seconds for which the orientations have not fit without a break.
-        lean: (n, 3) faded sum of the normalised innovations, whose covariance is the unit matrix times
-        leaning: (n,) this, if all is right.
+        slow_variance: (n, 3, 3) rad2, stationary covariance of g.
+        stated: (n, 2) rad2, variances of misalignment and heading by the last stated covariance.
+        stamps: (n,) nanoseconds, of the last orientation that was compared with the state.
+        unfit_for: (n,) seconds of inconsistent orientations without a break.
+        lean: (n, 3) faded sum of the normalised innovations.
+        leaning: (n,) variance of each component of ``lean`` for a consistent source.
     """
 
     names: tuple[str, ...]
@@ -147,7 +148,7 @@ class Sources:
         return type(self)(**{name: getattr(self, name) for name in self.__slots__} | changes)
 
     def moved(self, correction: FloatArray) -> Self:
-        """Corrected by (7 n,)."""
+        """The sources after a correction (7 n,)."""
         parts = correction.reshape(-1, PER_SOURCE)
         turned = so3.quat_to_matrix(so3.exp(parts[:, _MISALIGNMENT])) @ self.misalignment
         return self._but(
@@ -155,18 +156,18 @@ class Sources:
         )
 
     def faded(self, share: float) -> Self:
-        """After a time in which what persists has faded to this share."""
+        """The sources with their persistent errors g scaled by a decay factor."""
         return self._but(slow=share * self.slow)
 
     def kept(self, which: BoolArray) -> Self:
-        """Some (n,) of them."""
+        """Only the sources that ``which`` (n,) selects."""
         names = tuple(name for name, kept in zip(self.names, which, strict=True) if kept)
         return self._but(
             names=names, **{each: getattr(self, each)[which] for each in self.__slots__ if each != "names"}
         )
 
     def with_new(self, measurement: SegmentOrientation, parameters: OrientationParameters) -> tuple[Self, FloatArray]:
-        """With one more source at the end, and the (7, 7) prior covariance of its states."""
+        """The sources with another one at the end, and the (7, 7) prior covariance of its states."""
         slow_variance = _slow_variance(measurement.covariance, parameters)
         stated = _stated(measurement.covariance, parameters)
         covariance = np.zeros((PER_SOURCE, PER_SOURCE))
@@ -198,7 +199,7 @@ class Sources:
         lean: FloatArray,
         leaning: float,
     ) -> Self:
-        """After one more orientation by one of them."""
+        """The sources after another orientation of one of them, used or rejected."""
         new = {
             "slow_variance": _slow_variance(measurement.covariance, parameters),
             "stamps": measurement.stamp_ns,
@@ -214,15 +215,15 @@ class Sources:
     def restated(
         self, number: int, measurement: SegmentOrientation, parameters: OrientationParameters
     ) -> tuple[Self, FloatArray, FloatArray] | None:
-        """After a source has changed the variance that it states.
+        """The sources after one of them has changed the variance that it states.
 
         If it grows from a to b, the error is a random walk: b - a is added. If it shrinks, the source has corrected
         itself: of an error e of variance a, (b / a) e is left, and a new one of variance b (1 - b / a) is added: the
         regression of an optimal estimate's error on the one before.
 
         Returns:
-            What is known, (4,) what is left of the errors of misalignment and heading, and (4,) rad2 that are new; None
-            where it states hardly another variance.
+            The sources, (4,) factors on the errors of misalignment and heading, and (4,) rad2 that are added to their
+            variances; None if the stated variance has hardly changed.
         """
         before, after = self.stated[number], _stated(measurement.covariance, parameters)
         if (np.abs(after - before) < _SAME * before).all():
@@ -239,7 +240,7 @@ class Sources:
 
 
 def _stated(covariance: FloatArray, parameters: OrientationParameters) -> FloatArray:
-    """(2,) rad2, of misalignment per axis and of heading, by the covariance about the axes of world that is stated."""
+    """(2,) rad2, of misalignment per axis and of heading, from the stated (3, 3) covariance about the axes of world."""
     level = 0.5 * float(covariance[0, 0] + covariance[1, 1])
     return np.array(
         [parameters.misalignment_stddev**2 + level, max(parameters.heading_stddev**2, float(covariance[2, 2]))]
@@ -247,14 +248,14 @@ def _stated(covariance: FloatArray, parameters: OrientationParameters) -> FloatA
 
 
 def _slow_variance(covariance: FloatArray, parameters: OrientationParameters) -> FloatArray:
-    """(3, 3) rad2 of what persists for some seconds: of tissue, and of the source's own filter hardly more."""
+    """(3, 3) rad2, covariance of g: that of tissue, and at most as much again of the source's own filter."""
     tissue = parameters.tissue_stddev**2
     variance: FloatArray = tissue * _EYE3 + np.diag(np.minimum(covariance.diagonal(), tissue))
     return variance
 
 
 def advance(covariance: FloatArray, first: int, sources: Sources, dt: float) -> float:
-    """Let time pass over the covariance (first + 7 n, ...) of all, in place; the share to which what persists fades."""
+    """Predict the sources' part of a covariance (first + 7 n, first + 7 n) in place; the decay factor of g."""
     share = math.exp(-dt / TISSUE_TIME)
     fades = np.ones((len(sources), PER_SOURCE))
     fades[:, _SLOW] = share
@@ -271,12 +272,12 @@ def advance(covariance: FloatArray, first: int, sources: Sources, dt: float) -> 
 
 
 def about(axis: FloatArray) -> FloatArray:
-    """(7,) by how much a source's numbers turn its segment about its own z axis, (3,) in world; to first order."""
+    """(7,) derivative of a segment's measured rotation about its z axis (3,), in world, by the source's states."""
     return np.array([0.0, 0.0, 1.0, axis[2], *axis])
 
 
 def slipped(covariance: FloatArray, own: slice, parameters: OrientationParameters) -> FloatArray:
-    """The covariance of all after a source (its ``own`` rows) has slipped, or was switched off and on."""
+    """The covariance after a source (rows ``own``) has slipped, or was switched off and on."""
     covariance = covariance.copy()
     variance = np.array([_SLIP_STDDEV**2] * 3 + [parameters.heading_stddev**2] + [0.0] * 3)
     covariance[own, own] += np.diag(variance)
@@ -311,10 +312,10 @@ def expect(
     Args:
         model: the body.
         q: (35,) configuration.
-        sources: known ones.
-        number: which of them.
+        sources: all of them.
+        number: index of the source.
         measured: (3, 3) R_m.
-        correction: (7,) of what is known of the source; None for none.
+        correction: (7,) of the source's states; None for none.
     """
     rotation, turning = model.turning(q, int(sources.segments[number]))
     misalignment, slow, heading = sources.misalignment[number], sources.slow[number], float(sources.heading[number])
@@ -353,7 +354,7 @@ def _exp(vector: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def pose_of(model: UpperBody, ranges: Ranges, measurements: Sequence[SegmentOrientation]) -> FloatArray:
-    """(35,) the likeliest pose, with the base at the origin, of a body whose segments are turned so.
+    """(35,) the likeliest pose, with the base at the origin, for measured orientations of segments.
 
     Maximum a posteriori by Gauss-Newton steps from several headings of the base: coordinates without a measurement are
     in the middle of their range, and the pelvis upright.
@@ -372,7 +373,7 @@ def pose_of(model: UpperBody, ranges: Ranges, measurements: Sequence[SegmentOrie
 def _fitted(
     model: UpperBody, ranges: Ranges, q: FloatArray, lengths: FloatArray, segments: IntArray, measured: FloatArray
 ) -> tuple[FloatArray, float]:
-    """A configuration found from another one, and its cost."""
+    """(35,) configuration after Gauss-Newton steps from ``q``, and its cost."""
     nv = model.nv
     for _ in range(_STEPS):
         lines = model.linearise(q, lengths)

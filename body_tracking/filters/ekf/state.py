@@ -20,7 +20,7 @@ NOBODY = Sources.none()
 
 
 def single(values: FloatArray) -> SingleArray:
-    """In the precision of ``State.crosses``."""
+    """Values in single precision, that of ``State.crosses``."""
     return values.astype(np.float32)
 
 
@@ -43,9 +43,9 @@ class Measurement:
         sensor: its name.
         stamp_ns: capture time.
         positions: (19, 3) metres in world; 0 where not measured.
-        measured: (19,) which are.
+        measured: (19,) which points are measured.
         model_variance: (19,) square metres per axis by the measurement model, of white and slow errors together.
-        skeleton: where it comes from.
+        skeleton: the frame as received.
     """
 
     sensor: str
@@ -67,8 +67,8 @@ class SensorState(Changeable):
         differences: (19,) mean of the squared differences of each point alone.
         weight: (19,) how many of these there were.
         slow: scale of the slow variance of points.
-        slow_estimate: its running estimate, of which only a significant one is used.
-        slow_information: of the estimate.
+        slow_estimate: running estimate of this scale, used only if significant.
+        slow_information: of the running estimate.
         stated: whether its skeletons bring covariances, which include the systematic error.
     """
 
@@ -90,17 +90,17 @@ class State(Changeable):
     Attributes:
         stamp_ns: of the state.
         q, lengths, velocity: the estimate.
-        covariance: (85, 85) of the tangent, the lengths and the velocities; m more of m / 7 sources of orientations.
+        covariance: (85 + m, 85 + m) of tangent, lengths, velocities, and m states of m / 7 sources of orientations.
         sensors: estimated errors of each.
         slow_names: (n,) sensors whose slow errors are correlated with the state.
         crosses: (85 + m, 61 n) covariance of the state with the slow errors of these, in units of their deviation. In
             single precision: seven digits are enough for considered states, and with four cameras half the size of this
             largest matrix saves an eighth of a frame's time.
-        rejected_for: (19,) seconds.
+        rejected_for: (19,) seconds for which each point has been rejected.
         disputed: (57,) metres, innovations of rejected points, times the square root of the share of the time after
             which another pose is searched for; 0 of accepted points.
-        corrected: (53,) of tangent and lengths, by how much another pose that was found differs from the one before:
-            either may be wrong. It fades by ``reacquire_after``, while frames confirm the new one.
+        corrected: (53,) change of tangent and lengths by the last restart of the pose: either pose may be wrong. It
+            fades with ``reacquire_after``, while frames confirm the new one.
         used_ns: (19,) stamp of the last accepted measurement of each point.
         since_prior: seconds since ranges of motion were last applied.
         tracked: seconds since the start.
@@ -151,14 +151,14 @@ class StateSpace:
     Attributes:
         model: as given.
         ranges: of its motion.
-        prior: how people hold themselves.
-        prior_table: both as arrays.
+        prior: of posture.
+        prior_table: ranges and prior as arrays.
         points: how many of its joints are observed (19).
         nv: dimension of the tangent space (32).
         nl: how many lengths it has (21).
-        observed: of both together (53): what points depend on.
+        observed: size of tangent and lengths together (53), on which points depend.
         size: of the state without any source of orientations (85).
-        tangent, lengths, velocities: where these are in the state.
+        tangent, lengths, velocities: slices of the state.
         base_variance: (19,) square metres, systematic error of a camera that states no variances.
         rest_information: (32,) prior information on the tangent.
         lengths_covariance: (21, 21) of people's lengths.
@@ -188,7 +188,7 @@ class StateSpace:
                 self.thumbs[number] = model.joints == Joint[f"THUMB_{name.rsplit('_', 1)[1].upper()}"]
 
     def moved(self, state: State, correction: FloatArray) -> State:
-        """The state after a correction (85,)."""
+        """The state after a correction (85 or more,)."""
         lengths = state.lengths if state.settled else state.lengths + correction[self.lengths]
         return state.but(
             q=self.model.integrate(state.q, correction[self.tangent]),
