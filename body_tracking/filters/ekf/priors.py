@@ -75,13 +75,15 @@ class Priors:
         branch = self._ranges.nearest_branch(state.q)
         if branch is not None:
             return self._turned(state, *branch)
-        state = self._unsure(state)
+        state = self._without_spurious_information(state)
         if unknown.any():
-            state = self._told(state, gradients[unknown], -values[unknown], noise[unknown], self._free(state))
+            state = self._pseudo_measured(
+                state, gradients[unknown], -values[unknown], noise[unknown], self._free(state)
+            )
         if self._parameters.posture:
             rows = self._postural
             noise = 2.0 * _POSTURE_TIME / _PRIOR_PERIOD * limit[rows]
-            state = self._told(state, gradients[rows], -values[rows], noise, self._free(state))
+            state = self._pseudo_measured(state, gradients[rows], -values[rows], noise, self._free(state))
         vague = (variance > (VAGUE * stddev) ** 2) & ~self._postural
         if vague.any() and not state.sources.names:
             state = self._drawn(state, gradients[vague], values[vague], stddev[vague])
@@ -103,7 +105,7 @@ class Priors:
             crosses=state.crosses * single(both)[:, None],
         )
 
-    def _unsure(self, state: State) -> State:
+    def _without_spurious_information(self, state: State) -> State:
         """Remove spurious information about unobserved directions.
 
         The unobserved directions depend on the estimate, which is noisy; the update takes their rotation from frame to
@@ -170,7 +172,7 @@ class Priors:
             state = state.but(velocity=velocity)
         return state.but(q=self._ranges.clipped(state.q, _FAR_BEYOND))
 
-    def _told(
+    def _pseudo_measured(
         self,
         state: State,
         observation: FloatArray,
