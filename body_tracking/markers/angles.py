@@ -1,9 +1,9 @@
 """Angles of all joints of a chain from the poses of its targets at one instant (Gaschler 2011, 5.1.3 and 5.2.4).
 
-One weighted least squares fit of the chain's coordinates to all poses: the position of a target says as much of a
-joint's angle as its orientation does, each by its covariance, and a target that is not seen is left out. A ball joint
-has three angles, turns about the x, y and z axes of the parent target one after the other (intrinsic), which are
-continuous over time (:mod:`body_tracking.kinematics.euler`); a hinge has one, a universal joint two.
+One weighted least squares fit of the chain's coordinates to all target poses: positions and orientations both count,
+each weighted by its covariance; targets that are not seen are left out. A ball joint has three angles, intrinsic
+rotations about the x, y and z axes of the parent target, continuous over time (:mod:`body_tracking.kinematics.euler`);
+a hinge has one angle, a universal joint two.
 """
 
 from __future__ import annotations
@@ -26,46 +26,46 @@ from body_tracking.markers.pose_table import PoseTable, PoseTableError, pose_tab
 from body_tracking.markers.tree_loops import adjusted
 
 UNKNOWN: Final = 1.0
-"""Radians: a coordinate with a larger standard deviation is not known: its target is not seen."""
+"""Radians: a coordinate with a larger standard deviation counts as unknown, because its target is not seen."""
 _LOOSE: Final = 1e-2
-"""Information of a coordinate's step, 1/rad^2 and 1/m^2, beside that of the poses, 1e6 and more: the matrix can
-be inverted where the root target is not seen, and what is seen does not move."""
+"""Prior information of a coordinate's step, 1/rad^2 and 1/m^2; the poses give 1e6 and more. The matrix stays
+invertible where the root target is not seen, and visible targets are not biased."""
 _ITERATIONS: Final = 20
 _CONVERGED: Final = 1e-5
-"""Radians and metres of a step after which there is none; the error left is about its square."""
+"""Radians and metres: the iteration ends at a smaller step; the remaining error is about the step's square."""
 _TURN: Final = 2.0 * np.pi
 _EVER: Final = 360e3
-"""Degrees: no range is more usual than another, so that no angle ever jumps by a turn."""
+"""Degrees: ranges so wide that no angle is ever moved by a full turn to fit its range."""
 _XYZ: Final = EulerAngles(
     (np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])),
     ((-_EVER, _EVER), (-_EVER, _EVER), (-_EVER, _EVER)),
 )
 _SINGULAR: Final = np.pi / np.sqrt(3.0)
-"""Radians: the standard deviation of an angle that may be anything, as the outer ones where their axes coincide."""
+"""Radians: standard deviation of a uniformly distributed angle, as of the outer angles where their axes coincide."""
 
 
 class AngleError(BodyTrackingError):
-    """Sensitivities that do not go with the chain's targets or with the covariance of the calibration."""
+    """Raised for sensitivities that do not match the chain's targets or the covariance of the calibration."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChainAngles:
-    """Angles of a chain at one time; k angles of j joints.
+    """Angles of a chain at one time: k angles of j joints.
 
     Attributes:
         stamp_ns: capture time, nanoseconds.
         names: of the angles.
-        angles: (k,) radians, continuous over time; NaN where the target that would show them is not seen.
-        stddev: (k,) radians, of all below together; infinity where the angle is NaN.
-        noise: (k,) radians, what of it is from the noise of the poses,
-        model: (k,) radians, from the chain's covariance, and
-        calibration: (k,) radians, from the calibration of the cameras, which the chain was measured by too where its
-            sensitivity is known. The last two are the same errors in all frames.
+        angles: (k,) radians, continuous over time; NaN where the joint's target is not seen.
+        stddev: (k,) radians, total of the three parts below; infinity where the angle is NaN.
+        noise: (k,) radians, part by the noise of the poses.
+        model: (k,) radians, part by the chain's covariance.
+        calibration: (k,) radians, part by the calibration of the cameras, correlated with the chain's own dependence on
+            it where the chain's sensitivity is known. ``model`` and ``calibration`` are constant errors in all frames.
         rotations: (j, 3, 3) each joint's turn (:mod:`body_tracking.markers.joint_model`), NaN likewise.
         rotation_covariance: (j, 3, 3) square radians, of w such that the true turn is ``exp(w) @ rotation``.
         scale: root of the reduced chi squared of the fit; NaN where there are no more poses than coordinates.
-        gaps: (j,) metres between each joint's centre as its parent has it and as its child has it (Gaschler's residual,
-            section 5.1.3); NaN where one of both is not seen.
+        gaps: (j,) metres between each joint's centre by its parent's pose and by its child's (Gaschler's residual,
+            section 5.1.3); NaN where parent or child is not seen.
     """
 
     stamp_ns: int
@@ -82,7 +82,7 @@ class ChainAngles:
 
 
 class AngleEstimator:
-    """The angles of a chain, frame by frame; keeps nothing but the last posture and angles, to be continuous."""
+    """Estimates the angles of a chain frame by frame; its only state is the last posture and angles, for continuity."""
 
     def __init__(self, chain: Chain) -> None:
         self.chain = chain
@@ -94,7 +94,7 @@ class AngleEstimator:
         self._misfit = chain.scale**2 if chain.scale >= MISFIT_WARNING else 1.0
 
     def reset(self) -> None:
-        """Forget the last angles: the next ones are those nearest to zero."""
+        """Forget the last angles; the next ones are the solution nearest to zero."""
         self._posture = None
         self._previous[:] = np.nan
 
@@ -109,14 +109,14 @@ class AngleEstimator:
         Gaschler (2011): eq. 5.6; eq. 5.7; eq. 5.18.
 
         Args:
-            poses: of the targets that were found; those of targets of no joint are left out.
-            sensitivities: of each target (6, p) derivative of its pose (as in :attr:`TargetPose.covariance`) by p
+            poses: of the targets found; targets outside the chain are ignored.
+            sensitivities: by target, (6, p) derivative of its pose (as in :attr:`TargetPose.covariance`) by the p
                 parameters of the cameras' calibration.
-            calibration: (p, p) covariance of these.
+            calibration: (p, p) covariance of these parameters.
 
         Raises:
             PoseTableError: no pose of the chain's targets, or as :func:`body_tracking.markers.pose_table.pose_table`.
-            AngleError: sensitivities of other shapes, of not all the targets, or without a covariance.
+            AngleError: sensitivities missing for a target, of another shape, or without a covariance.
         """
         table = pose_table([poses], self._tree.targets)
         if not table.seen.any():
@@ -132,7 +132,7 @@ class AngleEstimator:
     def _systematic(
         self, table: PoseTable, sensitivities: Mapping[str, FloatArray] | None, calibration: FloatArray | None
     ) -> tuple[FloatArray, FloatArray] | None:
-        """(m, 6, p) sensitivities of all targets, zeros of those that are not seen, and (p, p)."""
+        """Sensitivities (m, 6, p) of all targets, zero where not seen, and the (p, p) covariance of the calibration."""
         if sensitivities is None:
             return None
         size = 0 if calibration is None else len(calibration)
@@ -159,7 +159,7 @@ class AngleEstimator:
         solution: tuple[FloatArray, FloatArray, float],
         systematic: tuple[FloatArray, FloatArray] | None,
     ) -> ChainAngles:
-        """The angles of a posture; the solution is its whitened derivatives, its covariance and the squared errors."""
+        """Angles of a posture; ``solution``: whitened derivatives, covariance, sum of squared residuals."""
         tree, size = self._tree, self._tree.size
         white, covariance, squares = solution
         gain = covariance @ white[:, :size].T
@@ -198,7 +198,7 @@ class AngleEstimator:
     def _angles(
         self, posture: Posture, covariance: FloatArray, known: BoolArray
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """(k,) angles, their (k, size) derivative by the coordinates, and (k,) whether each is not known."""
+        """Angles (k,), their (k, size) derivative by the coordinates, and (k,) whether each angle is unknown."""
         tree, count = self._tree, len(self._previous)
         angles, gradient, unknown = np.empty(count), np.zeros((count, tree.size)), np.zeros(count, dtype=bool)
         split = None
@@ -223,7 +223,7 @@ class AngleEstimator:
         return np.where(unknown, np.nan, angles), gradient, unknown
 
     def _near(self) -> FloatArray | None:
-        """(b, 3) the last angles of all ball joints, or None at the beginning."""
+        """(b, 3) last angles of all ball joints; None before the first frame."""
         near = np.stack([self._previous[self._rows(index)] for index in self._balls])
         unknown = np.isnan(near)
         return None if unknown.all() else np.where(unknown, 0.0, near)
@@ -233,7 +233,7 @@ class AngleEstimator:
         return slice(where.start - ROOT, where.stop - ROOT)
 
     def _turns(self, posture: Posture, covariance: FloatArray, known: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """(j, 3, 3) turns and their covariance, NaN where they are not known."""
+        """Turns (j, 3, 3) and their covariance, NaN where unknown."""
         tree = self._tree
         turns = np.concatenate(posture.turns)
         result = np.empty((len(turns), 3, 3))

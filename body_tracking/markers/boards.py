@@ -13,10 +13,10 @@ from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import FloatArray, IntArray
 
 WINDOW: Final = 0.3
-"""Half width of the window of a corner's subpixel search, in squares: a window that reaches the next corner is pulled
-to it (11 px on squares of 20 px: RMS 0.50 px instead of 0.21)."""
+"""Half width of the window of a corner's subpixel search, in squares. A window that reaches the next corner pulls the
+estimate to it (11 px on squares of 20 px: RMS 0.50 px instead of 0.21)."""
 _MIN_HALF: Final = 2
-"""Pixels; OpenCV's search needs a window of five."""
+"""Pixels: OpenCV's search needs a window of five."""
 _CRITERIA: Final = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-4)
 
 Image = NDArray[np.uint8]
@@ -32,8 +32,8 @@ class Chessboard:
     """A chessboard.
 
     Attributes:
-        columns: inner corners in a row.
-        rows: of inner corners.
+        columns: inner corners per row.
+        rows: number of rows of inner corners.
         square: width of a square, metres.
 
     Raises:
@@ -64,7 +64,7 @@ class Chessboard:
         return np.concatenate([across, down]).astype(np.intp)
 
     def find(self, image: Image) -> tuple[IntArray, FloatArray] | None:
-        """Indices (n,) and pixels (n, 2) of all corners of the board in a grey image; None where it is not found.
+        """Indices (n,) and pixels (n, 2) of all corners of the board in a grey image; None if the board is not found.
 
         Raises:
             BoardError: not a grey image of 8 bits.
@@ -83,11 +83,11 @@ class Chessboard:
 
 @dataclass(frozen=True, slots=True)
 class CharucoBoard:
-    """A chessboard with ArUco markers in its white squares: corners have numbers, and some may be hidden.
+    """A chessboard with ArUco markers in its white squares: corners are numbered, and some may be hidden.
 
     Attributes:
-        columns: squares in a row.
-        rows: of squares.
+        columns: squares per row.
+        rows: number of rows of squares.
         square: width of a square, metres.
         marker: width of a marker, metres.
         dictionary: of the markers, by OpenCV's name ("DICT_4X4_1000").
@@ -117,7 +117,7 @@ class CharucoBoard:
         return (_grid(self.columns - 1, self.rows - 1) + [1.0, 1.0, 0.0]) * self.square
 
     def find(self, image: Image) -> tuple[IntArray, FloatArray] | None:
-        """Indices (n,) and pixels (n, 2) of the corners in a grey image; None where fewer than four are found.
+        """Indices (n,) and pixels (n, 2) of the corners in a grey image; None if fewer than four are found.
 
         Raises:
             BoardError: not a grey image of 8 bits.
@@ -141,7 +141,7 @@ class CharucoBoard:
         pixel_width = np.linalg.norm(pixels[:, None] - pixels[None], axis=-1)
         neighbours = np.abs(board_width - self.square) < 1e-3 * self.square
         spacing = float(pixel_width[neighbours].min()) if neighbours.any() else 0.0
-        # nor may it reach the markers
+        # the window must not reach the markers either
         reach = min(WINDOW, 0.5 * (1.0 - self.marker / self.square))
         return numbers, _refined(image, pixels, reach * spacing)
 
@@ -158,7 +158,7 @@ def _check(image: Image) -> None:
 
 
 def _refined(image: Image, corners: FloatArray, reach: float) -> FloatArray:
-    """Corners (n, 2) to a fraction of a pixel, by what is within reach of them, pixels."""
+    """Subpixel corners (n, 2) from the image within ``reach`` pixels."""
     half = max(_MIN_HALF, int(reach))
     start = np.ascontiguousarray(corners.reshape(-1, 1, 2), dtype=np.float32)
     refined = _CV.cornerSubPix(image, start, (half, half), (-1, -1), _CRITERIA)

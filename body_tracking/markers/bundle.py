@@ -1,8 +1,8 @@
-"""Bundle adjustment: cameras and what they see, fitted together by least squares on pixels (Gaschler eq. 4.9).
+"""Bundle adjustment: least squares fit of cameras and observed points to pixels (Gaschler eq. 4.9).
 
-What is shared by all images (cameras) is dense, what belongs to one instant (the pose of a board, the ends of a wand)
-is a small block each. Levenberg-Marquardt eliminates the blocks by the Schur complement (Triggs et al. 2000, section
-6.1), whose inverse is the covariance of the shared parameters. scipy's ``least_squares`` takes no such structure.
+Shared parameters (cameras) are dense; the parameters of one instant (the pose of a board, the ends of a wand) are a
+small block each. Levenberg-Marquardt eliminates the blocks by the Schur complement (Triggs et al. 2000, section
+6.1), whose inverse is the covariance of the shared parameters. scipy's ``least_squares`` does not use such a structure.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from body_tracking.markers.rig import LENS, POSE, Rig
 
 _STEPS: Final = 100
 _CONVERGED: Final = 1e-10
-"""Relative change of the cost at which it stops."""
+"""Relative change of the cost at which the iteration ends."""
 _DAMPING: Final = 1e-4
 _MAX_DAMPING: Final = 1e10
 
@@ -31,12 +31,12 @@ State = TypeVar("State")
 
 
 class BundleError(BodyTrackingError):
-    """Too few observations, or observations that do not determine the parameters."""
+    """Raised for too few observations, or observations that do not determine the parameters."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Linearised:
-    """Residuals of a least squares problem with blocks, and their derivatives.
+    """Residuals of a least squares problem with local blocks, and their derivatives.
 
     Attributes:
         residuals: (m,) each divided by its standard deviation.
@@ -61,8 +61,9 @@ def minimise(
     """Minimise the sum of squared residuals by Levenberg-Marquardt.
 
     Args:
-        state: where to begin.
-        linearise: residuals and derivatives at a state; residuals that are not finite refuse the step to it.
+        state: initial state.
+        linearise: residuals and derivatives at a state; a step to a state with residuals that are not finite is
+            rejected.
         moved: the state after a step of (p,) shared and (count, k) local parameters.
 
     Returns:
@@ -110,7 +111,7 @@ Equations = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
 
 
 def _normal_equations(here: Linearised) -> Equations:
-    """Of the shared parameters (p, p) and (p,); mixed (v, p, k); of the blocks (v, k, k) and (v, k)."""
+    """Shared (p, p) and (p,), mixed (v, p, k), block (v, k, k) and (v, k) parts."""
     m, k = here.local.shape
     p = here.shared.shape[1]
     gather = sparse.csr_matrix((np.ones(m), (here.blocks, np.arange(m))), shape=(here.count, m))
@@ -126,7 +127,7 @@ def _normal_equations(here: Linearised) -> Equations:
 
 
 def _reduced(equations: Equations, damping: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Schur complement (p, p) and its right side (p,); each block's inverse times its mixed part, and right side."""
+    """Schur complement (p, p), its right side (p,), and each block's inverse times its mixed part and right side."""
     shared, right, mixed, blocks, block_right = equations
     diagonal = np.einsum("vii->vi", blocks)
     eye = np.eye(blocks.shape[1])
@@ -159,9 +160,9 @@ class Corners:
 
     Attributes:
         cameras: (m,) index of the camera of each corner.
-        views: (m,) index of the instant, that is, of the board's pose.
+        views: (m,) index of the instant, i.e. of the board's pose.
         board: (m, 3) the corner in the board's frame, metres.
-        pixels: (m, 2) where it is seen.
+        pixels: (m, 2) observed position.
     """
 
     cameras: IntArray
@@ -173,7 +174,7 @@ class Corners:
         return len(self.pixels)
 
     def where(self, chosen: BoolArray) -> Corners:
-        """Those that are chosen (m,), their views numbered as before."""
+        """The chosen corners (m,); views keep their numbers."""
         return Corners(self.cameras[chosen], self.views[chosen], self.board[chosen], self.pixels[chosen])
 
 
@@ -184,8 +185,8 @@ class Adjusted:
     Attributes:
         rig: with the covariance of its parameters.
         rotations: (v, 3, 3) and
-        translations: (v, 3) metres: of the boards, into the rig's frame.
-        residuals: (m, 2) seen minus predicted, pixels.
+        translations: (v, 3) metres: poses of the boards in the rig's frame.
+        residuals: (m, 2) observed minus predicted, pixels.
         noise: standard deviation of a corner's coordinate, from the residuals and degrees of freedom, pixels.
     """
 
@@ -196,7 +197,9 @@ class Adjusted:
     noise: float
 
     def rms(self, chosen: BoolArray | None = None) -> float:
-        """Root of the mean squared distance, pixels; OpenCV's figure: of the 2D norm, sqrt(2) of an axis' RMS."""
+        """Root mean square of the 2D residual's norm, pixels, as OpenCV defines it: sqrt(2) times the RMS of one
+        axis.
+        """
         residuals = self.residuals if chosen is None else self.residuals[chosen]
         return float(np.sqrt((residuals**2).sum(axis=-1).mean()))
 
@@ -207,18 +210,18 @@ _Boards = tuple[Rig, FloatArray, FloatArray]
 def adjust(rig: Rig, rotations: FloatArray, translations: FloatArray, corners: Corners, free: BoolArray) -> Adjusted:
     """Fit cameras and boards to corners.
 
-    Gaschler (2011): eq. 4.9; figure 4.2; eq. 4.10-4.12: least squares are the most probable where the noise of all
+    Gaschler (2011): eq. 4.9; figure 4.2; eq. 4.10-4.12: least squares are the maximum likelihood where the noise of all
     corners is normal, independent and equal.
 
     Args:
-        rig: where to begin.
+        rig: initial cameras.
         rotations: (v, 3, 3) and
-        translations: (v, 3) of the boards where to begin; boards without corners keep them.
-        corners: what is seen.
+        translations: (v, 3) initial poses of the boards; boards without corners keep them.
+        corners: observed corners.
         free: (p,) which parameters of the rig are fitted; the others keep their value and have no variance.
 
     Raises:
-        BundleError: corners that are not finite, behind a camera, or fewer than determine the parameters.
+        BundleError: corners that are not finite, behind a camera, or too few to determine the parameters.
     """
     seen, views = np.unique(corners.views, return_inverse=True)
     chosen = np.flatnonzero(free)
@@ -275,9 +278,9 @@ def free_parameters(rig: Rig, coefficients: tuple[int, ...] | None, poses: bool 
     """(p,) which parameters of a rig an adjustment fits.
 
     Args:
-        rig: the rig; the pose of its first camera is its frame, and stays.
-        coefficients: which coefficients of the distortion are free beside the camera's matrix: (0, 1) the radial ones
-            of Gaschler's eq. 4.7; None for lenses that are known as a whole.
+        rig: the rig; the pose of its first camera defines the rig's frame and stays fixed.
+        coefficients: free distortion coefficients, beside the camera's matrix: (0, 1) for the radial ones of Gaschler's
+            eq. 4.7; None for fixed lenses.
         poses: whether the poses of the other cameras are free.
     """
     free = np.zeros(rig.size, dtype=np.bool_)

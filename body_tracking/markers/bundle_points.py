@@ -1,7 +1,7 @@
-"""Bundle adjustment of cameras and points that are free, except for known distances between some of them.
+"""Bundle adjustment of cameras and free points with known distances between some of them.
 
-The two ends of a wand are such points. So are the corners of a printed board that is bent: its squares keep their
-edges, it is no plane. Where a board is not stiff this fits to the noise of its corners, and a plane does not.
+Such points are the two ends of a wand, or the corners of a printed board that is bent: its squares keep their edge
+lengths, but the board is no plane. This model fits a flexible board down to the noise of its corners; a plane does not.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Sightings:
         cameras: (m,) index of the camera.
         views: (m,) index of the instant.
         points: (m,) index of the point of the object.
-        pixels: (m, 2) where it is seen.
+        pixels: (m, 2) observed position.
     """
 
     cameras: IntArray
@@ -34,7 +34,7 @@ class Sightings:
     pixels: FloatArray
 
     def where(self, chosen: BoolArray) -> Sightings:
-        """Those that are chosen (m,), their views numbered as before."""
+        """The chosen sightings (m,); views keep their numbers."""
         return Sightings(self.cameras[chosen], self.views[chosen], self.points[chosen], self.pixels[chosen])
 
 
@@ -45,7 +45,7 @@ class Lengths:
     Attributes:
         pairs: (e, 2) indices of the points.
         metres: (e,) their distances.
-        deviation: by which the distance of a pair differs from that at an instant, metres.
+        deviation: standard deviation of the distance of a pair at an instant, metres.
     """
 
     pairs: IntArray
@@ -60,8 +60,8 @@ class AdjustedPoints:
     Attributes:
         rig: with the covariance of its parameters.
         points: (v, n, 3) in the rig's frame, metres.
-        residuals: (m, 2) seen minus predicted, pixels.
-        length_errors: (v, e) metres, of the fitted points; NaN where one of a pair is not seen.
+        residuals: (m, 2) observed minus predicted, pixels.
+        length_errors: (v, e) fitted minus known distance, metres; NaN where a point of the pair is not seen.
         noise: standard deviation of a coordinate of an image, from the residuals and degrees of freedom, pixels.
     """
 
@@ -72,19 +72,19 @@ class AdjustedPoints:
     noise: float
 
     def rms(self, chosen: BoolArray | None = None) -> float:
-        """Root of the mean squared distance, pixels (2D norm)."""
+        """Root mean square of the 2D residual's norm, pixels."""
         residuals = self.residuals if chosen is None else self.residuals[chosen]
         return float(np.sqrt((residuals**2).sum(axis=-1).mean()))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
-    """What is known of the lenses of cameras before an adjustment.
+    """Prior of the cameras' lenses.
 
     Attributes:
         lenses: (p,) parameters of the rig; those of poses are not used.
-        known: (p,) which of them have a variance.
-        whitening: (k, k) W of these k, so that W^T W is the inverse of their covariance.
+        known: (p,) whether a parameter has a prior.
+        whitening: (k, k) W of these k parameters: W^T W is the inverse of their covariance.
     """
 
     lenses: FloatArray
@@ -93,7 +93,7 @@ class Prior:
 
     @classmethod
     def of(cls, rig: Rig) -> Prior:
-        """The lenses of a rig with their covariance, whatever its poses are."""
+        """Prior from the lenses of a rig and their covariance; its poses are not used."""
         known = projection.lenses_of(rig) & (np.diag(rig.covariance) > 0.0)
         deviations = np.sqrt(np.diag(rig.covariance)[known])
         # scaled to a unit diagonal: focal lengths and coefficients differ by orders of magnitude
@@ -105,7 +105,7 @@ class Prior:
 
 _Points = tuple[Rig, FloatArray]
 _LEAST_VARIANCE: Final = 1e-9
-"""Of a combination of parameters, each in units of its own deviation: rounding in a file makes zero or less of it."""
+"""Lower bound of the eigenvalues of the correlation matrix; rounding in a file can make them zero or negative."""
 
 
 def adjust_points(
@@ -117,19 +117,19 @@ def adjust_points(
     noise: float,
     prior: Prior | None = None,
 ) -> AdjustedPoints:
-    """Fit cameras and points to what is seen.
+    """Fit cameras and points to the observed pixels.
 
     Args:
-        rig: where to begin.
-        points: (v, n, 3) metres, where to begin; what is not seen is not used.
-        seen: each point by two cameras or more.
+        rig: initial cameras.
+        points: (v, n, 3) metres, initial positions; points that are not seen are not used.
+        seen: each point in two cameras or more.
         lengths: of the object; they give the scale.
         free: (p,) which parameters of the rig are fitted; the others keep their value and have no variance.
-        noise: expected standard deviation of a coordinate in an image, pixels; against the lengths' deviation.
-        prior: what is known of the cameras' lenses before.
+        noise: expected standard deviation of a pixel coordinate, pixels; weights pixels against lengths.
+        prior: prior of the cameras' lenses.
 
     Raises:
-        BundleError: pixels that are not finite, behind a camera, or fewer than determine the parameters.
+        BundleError: pixels that are not finite, behind a camera, or too few to determine the parameters.
     """
     count, object_points = points.shape[:2]
     chosen = np.flatnonzero(free)

@@ -1,4 +1,4 @@
-"""How good a calibration of cameras is: Gaschler's table 4.1, and a board's squares measured by triangulation."""
+"""Quality of a camera calibration: Gaschler's table 4.1, and errors of triangulated edges of a board's squares."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def _pose(rig: Rig, index: int) -> list[str]:
     turn = so3.rotation_vectors(rig.rotations[index])
     shift = rig.translations[index]
     angle, distance = float(np.linalg.norm(turn)), float(np.linalg.norm(shift))
-    # the axis turns with itself: the angle changes by the part of exp(w) along it
+    # the rotation vector is its own eigenvector: the angle changes by the component of w along it
     angle_deviation = float(np.sqrt(turn @ covariance[:3, :3] @ turn)) / max(angle, 1e-12)
     distance_deviation = float(np.sqrt(shift @ covariance[3:, 3:] @ shift)) / max(distance, 1e-12)
     return [
@@ -61,12 +61,12 @@ def _pose(rig: Rig, index: int) -> list[str]:
 
 
 def edge_errors(rig: Rig, board: Chessboard, corners: Corners) -> FloatArray:
-    """Relative errors (n,) of the triangulated edges of a board's squares, by all cameras that see both ends.
+    """Relative errors (n,) of the triangulated edges of a board's squares, from all cameras that see both ends.
 
     Args:
         rig: the cameras.
         board: the board.
-        corners: of it.
+        corners: of this board.
     """
     index = np.rint(corners.board[:, :2] / board.square).astype(np.intp)
     numbers = index[:, 0] + board.columns * index[:, 1]
@@ -87,10 +87,10 @@ def left_out_edge_errors(
     corners: Corners,
     coefficients: tuple[int, ...] = RADIAL,
 ) -> FloatArray:
-    """As :func:`edge_errors`, each view's by the calibration of all others: what the calibration is worth elsewhere.
+    """As :func:`edge_errors`, but each view by the calibration from all other views (leave-one-out).
 
     Raises:
-        CalibrationError: without one of the views the cameras cannot be calibrated.
+        CalibrationError: the cameras cannot be calibrated without one of the views.
     """
     errors = []
     for view in np.unique(corners.views):

@@ -1,9 +1,9 @@
 """Calibration of the cameras of a rig from images of a board (Gaschler 4.1), with the covariance of the result.
 
-Each camera is calibrated by itself first (Zhang 2000, by OpenCV; eq. 4.8), boards give the poses of cameras to each
-other, and a bundle adjustment fits everything together (eq. 4.9). Boards that contradict the others (corners counted
-from another end, found where there are none, of another instant) are named and left out: by the homography of a plane,
-by each camera's fit, by where other cameras see the board, and by the residuals of the adjustment.
+Each camera is first calibrated alone (Zhang 2000, by OpenCV; eq. 4.8), boards give the relative poses of the cameras,
+and a bundle adjustment fits everything together (eq. 4.9). Boards that contradict the others (corners counted from
+another end, false detections, another instant) are rejected and named: by the homography of a plane, by each camera's
+fit, by where other cameras see the board, and by the residuals of the adjustment.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ PLUMB_BOB: Final = (0, 1, 2, 3, 4)
 """All of ``plumb_bob``: k1, k2, p1, p2, k3."""
 
 MIN_CORNERS: Final = 6
-"""Of a board in an image: four determine its pose and leave nothing to check it by."""
+"""Of a board in an image: four determine its pose and leave no redundancy to check it."""
 MIN_BOARDS: Final = 3
 """In images of a camera: two or more determine a camera's matrix (Zhang 2000), one more checks it."""
 _PLANE: Final = (4.0, 2.0)
-"""A board's RMS about its homography is suspicious beyond so many times the camera's median plus so many pixels:
-lens distortion, which a homography does not have, bends the rows by pixels."""
+"""A board is rejected if its RMS about its homography exceeds the first number times the camera's median plus the
+second number of pixels: lens distortion, which a homography does not model, bends rows by pixels."""
 _SINGLE: Final = (4.0, 0.3)
-"""A board's RMS in its camera's own calibration, likewise."""
+"""Bound of a board's RMS in its camera's own calibration; same form."""
 _ACROSS: Final = (5.0, 3.0)
-"""How far a board is from where another camera's board says, median over corners, likewise."""
+"""Bound of the distance between a board and its prediction from another camera, median over corners; same form."""
 _ADJUSTED: Final = (2.0, 0.1)
-"""A board's RMS in the bundle adjustment, likewise."""
+"""Bound of a board's RMS in the bundle adjustment; same form."""
 _NO_FIT: Final = "its corners do not fit the camera"
 _CV: Any = cv2
 
@@ -55,8 +55,8 @@ class Rejected:
 
     Attributes:
         view: index of the instant.
-        camera: frame of the camera whose board it is; None where two cameras contradict each other and it is unknown
-            which is wrong.
+        camera: frame of the camera whose board it is; None where two cameras contradict each other and the wrong one is
+            unknown.
         reason: in words.
     """
 
@@ -72,8 +72,8 @@ class CameraCalibration:
     Attributes:
         rig: with its covariance.
         adjusted: the bundle adjustment.
-        corners: those that it used, in the order of its residuals.
-        rejected: boards that it did not use.
+        corners: the corners used, in the order of the residuals.
+        rejected: boards left out.
     """
 
     rig: Rig
@@ -82,11 +82,11 @@ class CameraCalibration:
     rejected: tuple[Rejected, ...]
 
     def rms(self) -> FloatArray:
-        """(c,) each camera's root mean squared distance, pixels; of the 2D norm, as OpenCV gives it."""
+        """(c,) root mean square of each camera's 2D residual norm, pixels, as OpenCV defines it."""
         return np.array([self.adjusted.rms(self.corners.cameras == index) for index in range(len(self.rig.cameras))])
 
     def rms_by_axis(self) -> FloatArray:
-        """(c, 2) each camera's root mean squared residual in x and in y, pixels, as Gaschler's table 4.1 has it."""
+        """(c, 2) root mean square of each camera's residuals in x and in y, pixels, as in Gaschler's table 4.1."""
         return np.stack(
             [
                 np.sqrt((self.adjusted.residuals[self.corners.cameras == index] ** 2).mean(axis=0))
@@ -97,7 +97,7 @@ class CameraCalibration:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Seen:
-    """A board in an image: rows of the corners, and its pose in the camera."""
+    """A board in an image: row indices of its corners, and its pose in the camera's frame."""
 
     rows: IntArray
     rotation: FloatArray
@@ -109,10 +109,10 @@ def find_boards(board: Chessboard | CharucoBoard, images: Sequence[Sequence[Imag
 
     Args:
         board: the board.
-        images: of each camera, grey, one for each instant; None where a camera has no image of it.
+        images: per camera a sequence of grey images, one per instant; None where a camera has none.
 
     Raises:
-        BoardError: an image that is none.
+        BoardError: an image of another shape or type.
         CalibrationError: cameras with different numbers of images, or no board in any image.
     """
     if len({len(each) for each in images}) != 1:
@@ -145,13 +145,13 @@ def calibrate_cameras(
     Gaschler (2011): eq. 4.8.
 
     Args:
-        frames: of the cameras; the first is the rig's.
+        frames: of the cameras; the first one is the rig's frame.
         sizes: width and height of each camera's images, pixels.
         corners: of a flat board (z = 0), seen at instants common to the cameras.
-        coefficients: of the distortion that are fitted, :data:`RADIAL` or more; the others are zero.
+        coefficients: distortion coefficients to fit, :data:`RADIAL` or more; the others are zero.
 
     Raises:
-        CalibrationError: a camera sees too few good boards, or shares none with the others; a pixel is not finite.
+        CalibrationError: a camera sees too few good boards or shares none with the others, or a pixel is not finite.
     """
     if len(frames) != len(sizes):
         raise CalibrationError(f"{len(frames)} frames, {len(sizes)} sizes of images")
@@ -169,16 +169,16 @@ def calibrate_cameras(
 def calibrate_poses(
     cameras: Sequence[Camera], corners: Corners, coefficients: tuple[int, ...] | None = None
 ) -> CameraCalibration:
-    """Calibrate the poses to each other of cameras whose lenses are known.
+    """Calibrate the relative poses of cameras with known lenses.
 
     Args:
         cameras: two or more; the first one's frame is the rig's.
         corners: of a flat board (z = 0), seen at instants common to the cameras.
-        coefficients: of the distortion, which are fitted again with the cameras' matrices, from the known values on;
-            None keeps the lenses.
+        coefficients: distortion coefficients to refine, with the cameras' matrices, from the known values; None keeps
+            the lenses fixed.
 
     Raises:
-        CalibrationError: a camera sees too few good boards, or shares none with the others; a pixel is not finite.
+        CalibrationError: a camera sees too few good boards or shares none with the others, or a pixel is not finite.
     """
     _check(corners, len(cameras))
     rejected: list[Rejected] = []
@@ -218,7 +218,7 @@ def _too_large(values: FloatArray, bound: tuple[float, float]) -> BoolArray:
 
 
 def _planar(rows: IntArray, corners: Corners) -> float:
-    """RMS of a board's corners about their homography, pixels; infinite where there is none."""
+    """RMS of a board's corners about their homography, pixels; infinite if OpenCV finds no homography."""
     homography, _ = _CV.findHomography(corners.board[rows, :2], corners.pixels[rows])
     if homography is None:
         return float("inf")
@@ -228,10 +228,10 @@ def _planar(rows: IntArray, corners: Corners) -> float:
 
 
 def _planar_boards(frame: str, index: int, corners: Corners, rejected: list[Rejected]) -> dict[int, IntArray]:
-    """Rows of the corners of each board in a camera's images, without boards whose corners are of no plane."""
+    """Rows of the corners of each board in a camera's images; boards whose corners are not coplanar are rejected."""
     of_camera = corners.cameras == index
     boards = {int(view): np.flatnonzero(of_camera & (corners.views == view)) for view in np.unique(corners.views)}
-    # five corners or fewer, or corners in a row, which have no homography
+    # fewer than MIN_CORNERS, and collinear corners, determine no homography
     boards = {
         view: rows
         for view, rows in boards.items()
@@ -244,7 +244,7 @@ def _planar_boards(frame: str, index: int, corners: Corners, rejected: list[Reje
 
 
 def _board_pose(camera: Camera, rows: IntArray, corners: Corners) -> _Seen:
-    """Pose of a board in a camera whose lens is known."""
+    """Pose of a board in a camera with a known lens."""
     flat = camera.undistort(corners.pixels[rows])
     if not np.isfinite(flat).all():
         raise CalibrationError(f"camera {camera.frame_id}: a corner where its distortion gives no direction")
@@ -260,7 +260,7 @@ def _board_pose(camera: Camera, rows: IntArray, corners: Corners) -> _Seen:
 def _single_camera(
     frame: str, size: tuple[int, int], index: int, corners: Corners, rejected: list[Rejected]
 ) -> tuple[Camera, dict[int, _Seen]]:
-    """A camera's own calibration (eq. 4.8) and its boards, without those that are no plane or do not fit."""
+    """A camera's own calibration (eq. 4.8) and its boards, without those that are not planar or do not fit."""
     boards = _planar_boards(frame, index, corners, rejected)
     while True:
         _check_count(frame, boards)
@@ -308,7 +308,7 @@ def _without(
 
 
 def _missed(camera: Camera, pose: _Seen, board: _Seen, corners: Corners) -> FloatArray:
-    """(n,) distances of a board's corners in an image from where a pose in the camera says, pixels."""
+    """(n,) distances between a board's corners in an image and their projections by a pose, pixels; inf if invalid."""
     points = corners.board[board.rows] @ pose.rotation.T + pose.translation
     missed: FloatArray = np.linalg.norm(camera.project(points) - corners.pixels[board.rows], axis=-1)
     return np.where(np.isfinite(missed), missed, np.inf)
@@ -321,7 +321,7 @@ def _rms(distances: FloatArray) -> float:
 def _camera_poses(
     cameras: list[Camera], seen: list[dict[int, _Seen]], corners: Corners
 ) -> tuple[FloatArray, FloatArray]:
-    """Poses (c, 3, 3), (c, 3) of the cameras, from the first on along pairs that share most boards."""
+    """Poses (c, 3, 3), (c, 3) of the cameras: a tree from the first camera along pairs that share most boards."""
     count = len(cameras)
     rotations, translations = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
     known, rest = [0], set(range(1, count))
@@ -341,7 +341,7 @@ def _camera_poses(
 def _relative_pose(
     camera: Camera, first: dict[int, _Seen], second: dict[int, _Seen], corners: Corners
 ) -> tuple[FloatArray, FloatArray]:
-    """Pose of the second camera in the first: of all that single boards give, the least median of distances."""
+    """Pose of the second camera in the first: the candidate of one board with the least median reprojection error."""
     views = sorted(first.keys() & second.keys())
     candidates = []
     for view in views:
@@ -359,7 +359,7 @@ def _moved(board: _Seen, rotation: FloatArray, translation: FloatArray) -> _Seen
 
 
 def _reject_contradictions(rig: Rig, seen: list[dict[int, _Seen]], corners: Corners, rejected: list[Rejected]) -> None:
-    """Take out boards that are not where other cameras see them; both of two that contradict each other."""
+    """Reject boards that are not where other cameras see them; both boards if only two contradict each other."""
     distances: dict[tuple[int, int, int], float] = {}
     for a in range(len(seen)):
         for b in range(len(seen)):
@@ -398,10 +398,10 @@ def _adjusted(
     coefficients: tuple[int, ...] | None,
     rejected: list[Rejected],
 ) -> CameraCalibration:
-    """Bundle adjustment; the board with the largest residuals is left out until none has too large ones."""
+    """Bundle adjustment; rejects the board with the largest residuals until none exceeds the bound."""
     views = int(corners.views.max()) + 1
     turns, shifts = np.tile(np.eye(3), (views, 1, 1)), np.zeros((views, 3))
-    for index in reversed(range(len(seen))):  # a board's pose from the first camera that sees it
+    for index in reversed(range(len(seen))):  # the first camera that sees a board gives its initial pose
         for view, board in seen[index].items():
             turns[view] = rig.rotations[index].T @ board.rotation
             shifts[view] = rig.rotations[index].T @ (board.translation - rig.translations[index])
@@ -420,7 +420,7 @@ def _adjusted(
             return CameraCalibration(rig, adjusted, used, tuple(rejected))
         index, view = keys[worst]
         present = [each for each, boards in enumerate(seen) if view in boards]
-        # of two cameras, both residuals come from the one wrong board
+        # with two cameras, one wrong board raises the residuals of both
         alone = len(present) != 2
         reason = f"does not fit the other boards: RMS {errors[worst]:.2f} px, others {np.median(errors):.2f}"
         rejected.append(Rejected(view, rig.cameras[index].frame_id if alone else None, reason))

@@ -32,20 +32,20 @@ RENDER: Final = "render"
 FOLDER: Final = "folder:"
 _RENDERED: Final = "body_tracking.simulation.marker_bags:RenderedImages"
 _LATE_NS: Final = NANOSECONDS
-"""A source that is later than this leaves images out."""
+"""Nanoseconds: a source that falls further behind skips sets."""
 CONVERTED: Final = "colour images"
 SIZES: Final = "images of another size"
 
 
 class CameraError(BodyTrackingError):
-    """The images do not go together with the rig, or there are none."""
+    """Raised for images that do not match the rig, or a folder without images."""
 
 
 class ImageSets(Protocol):
-    """Sets of images of all cameras, which are not a driver's.
+    """Sets of images of all cameras from another source than drivers.
 
     Attributes:
-        unpaired: number of images that are left out for lack of those of the other cameras.
+        unpaired: number of images without a counterpart in the other cameras.
     """
 
     unpaired: int
@@ -58,12 +58,12 @@ class ImageSets(Protocol):
 
 
 class FolderImages:
-    """Image files in a folder per camera; those of equal names were taken together, in the order of the names.
+    """Image files in one folder per camera; files of equal names form a set, in the order of the names.
 
     Colour images become grey; PNG files may have 16 bits.
 
     Args:
-        folder: with a folder per camera.
+        folder: contains one folder per camera.
         cameras: their names.
 
     Raises:
@@ -87,7 +87,7 @@ class FolderImages:
         return len(self._names)
 
     def images(self, index: int) -> list[NDArray[Any]]:
-        """As :meth:`ImageSets.images`; CameraError for a file that is no image."""
+        """As :meth:`ImageSets.images`; raises CameraError for a file that is no image."""
         found = []
         for folder in self._folders:
             path = folder / self._names[index]
@@ -226,7 +226,7 @@ class CameraImagesStage(Stage):
             yield Output(setup.image_topic(frame), (stamp_ns, frame, image), stamp_ns)
 
     def _index(self) -> int:
-        """Of the next set; rendered motion goes back and forth, so that it does not jump."""
+        """Index of the next set; the rendered motion goes back and forth, so that it does not jump."""
         assert self._source is not None
         count = len(self._source)
         if self.values["images"] != RENDER or count == 1:
@@ -237,7 +237,7 @@ class CameraImagesStage(Stage):
     # --- both
 
     def _check(self, frame: str, pixels: NDArray[Any]) -> None:
-        """Raise CameraError for an image that is not of the size for which the camera was calibrated."""
+        """Raise CameraError for an image whose size differs from the calibrated one."""
         camera = self._cameras[frame]
         self._problems.pop(frame, None)
         if pixels.shape != (camera.height, camera.width):
@@ -248,7 +248,7 @@ class CameraImagesStage(Stage):
             raise CameraError(text)
 
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
-        """Images of another size, drivers out of step, and a driver of which nothing came are named."""
+        """Warn of images of another size, unsynchronised drivers, or missing images."""
         problems = [*self._problems.values(), *([self._sets.problem()] if self._sets.problem() else [])]
         if self._topics and not problems and not self._counters["sets of images"]:
             problems.append(f"no set of images of {', '.join(self._topics)} yet")

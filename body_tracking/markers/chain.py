@@ -1,4 +1,4 @@
-"""A kinematic chain: targets that joints connect to a tree, fitted as a whole (Gaschler 2011, section 5.3)."""
+"""A kinematic chain: a tree of targets connected by joints, fitted as a whole (Gaschler 2011, section 5.3)."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from body_tracking.markers.pose_table import PoseTable, pose_table
 
 
 class ChainError(BodyTrackingError):
-    """A chain whose parts do not go together."""
+    """Raised for a chain with inconsistent parts."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chain:
-    """Joints and targets of a tree, and how sure they are.
+    """Joints and targets of a tree, with covariance.
 
     Attributes:
-        joints: each after that of its parent, as :func:`body_tracking.markers.joint_tree.tree_of` orders them.
+        joints: each after its parent, in the order of :func:`body_tracking.markers.joint_tree.tree_of`.
         covariance: (12 j, 12 j) of the parameters of all joints, as :attr:`Joint.covariance`.
         sensitivity: (12 j, q) derivative of the parameters by the q parameters of the calibration of the cameras that
-            measured the recording; (12 j, 0) where it is not known.
-        scale: root of the reduced chi squared of the fit. From 1.3 on the targets move against the chain by more than
-            the noise of their poses, and the standard deviations of angles grow by it.
-        tree: made of the joints.
+            measured the recording; (12 j, 0) if unknown.
+        scale: root of the reduced chi squared of the fit. From 1.3 on, the targets move against the chain by more than
+            the noise of their poses, and the standard deviations of angles are multiplied by the scale.
+        tree: derived from the joints.
 
     Raises:
         ChainError: joints in another order, a covariance or sensitivity of another shape or with numbers that are not
@@ -78,7 +78,7 @@ class Chain:
 
 @dataclass(frozen=True, slots=True)
 class JointDescription:
-    """A joint that is to be fitted: its name, the targets before and behind it, its kind."""
+    """A joint to be fitted: its name, parent and child targets, and kind."""
 
     name: str
     parent: str
@@ -92,8 +92,8 @@ class ChainFit:
 
     Attributes:
         chain: with its covariance.
-        joints: what each joint by itself says, in the order of the chain's.
-        warnings: a line for each thing that is wrong.
+        joints: fit of each joint alone, in the chain's order.
+        warnings: one line per problem.
     """
 
     chain: Chain
@@ -109,21 +109,20 @@ def fit_chain(
 ) -> ChainFit:
     """Fit all joints of a chain to a recording.
 
-    Single joints start the adjustment of the whole; targets may be missing in any frame.
+    The fits of single joints initialise the joint adjustment; targets may be missing in any frame.
 
     Args:
-        frames: of each instant the poses that were found; those of targets that the description does not name are left
-            out.
+        frames: per instant the poses found; targets that the description does not name are ignored.
         description: of the joints, in any order.
-        sensitivities: for each frame, of each of its targets, (6, q) derivative of its pose (as in
-            :attr:`TargetPose.covariance`) by q parameters of the cameras' calibration. None where these are known.
-        shapes: for each frame, of each of its targets, (6, s) what the errors of its own geometry add to its pose
-            (:func:`body_tracking.markers.corrections.shape_effects`). None where the targets are known.
+        sensitivities: per frame, by target, (6, q) derivative of its pose (as in :attr:`TargetPose.covariance`) by q
+            parameters of the cameras' calibration. None where these are exactly known.
+        shapes: per frame, by target, (6, s) effects of the errors of its own geometry on its pose
+            (:func:`body_tracking.markers.corrections.shape_effects`). None where the targets are exactly known.
 
     Raises:
-        ChainError: sensitivities or shapes of another number of frames, not of all targets, or of other shapes.
-        JointFitError: too few frames in which both targets of a joint are seen.
-        TreeError: the joints are no tree.
+        ChainError: sensitivities or shapes for another number of frames, missing for a target, or of another shape.
+        JointFitError: too few frames with both targets of a joint.
+        TreeError: the joints form no tree.
         JointError: an invalid name.
         PoseTableError: as :func:`body_tracking.markers.pose_table.pose_table`.
     """
@@ -149,7 +148,7 @@ def fit_chain(
     found = maximise(tree.with_joints([fit.joint for fit in fits]), poses, MISFIT_WARNING, shared)
     if found.scale >= MISFIT_WARNING and not any(fit.scale >= MISFIT_WARNING for fit in fits):
         warnings.append(f"chain: errors are {found.scale:.2g} times the poses' noise, though each joint fits by itself")
-    # the targets' errors, which are the same in all frames, have no parameters that others share
+    # shape errors are constant over the frames, and nothing else depends on them
     of_shapes = found.sensitivity[:, known:]
     covariance = found.covariance + of_shapes @ of_shapes.T
     return ChainFit(
@@ -158,13 +157,13 @@ def fit_chain(
 
 
 def _own(poses: PoseTable, shapes: Sequence[Mapping[str, FloatArray]]) -> FloatArray:
-    """(n, m, 6, s) the effects of all targets' errors, which are each target's own: zeros for those of others."""
+    """(n, m, 6, s) effects of the geometry errors of all targets; each target has columns of its own."""
     parts = [_shared(poses, shapes, column) for column in range(len(poses.targets))]
     return np.concatenate(parts, axis=-1)
 
 
 def _shared(poses: PoseTable, sensitivities: Sequence[Mapping[str, FloatArray]], only: int | None = None) -> FloatArray:
-    """(n, m, 6, q) sensitivities of the poses of a table, of one target or all; zeros of those that are not seen."""
+    """(n, m, 6, q) sensitivities of the poses of a table, of one target or all; zero for poses not seen."""
     if len(sensitivities) != len(poses):
         raise ChainError(f"sensitivities of {len(sensitivities)} frames, expected {len(poses)}")
     names = poses.targets if only is None else (poses.targets[only],)

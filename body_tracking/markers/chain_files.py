@@ -26,11 +26,11 @@ _HEADER = """\
 
 
 class ChainFileError(BodyTrackingError):
-    """A chain's file cannot be written or read, or lacks or misstates a value; or a chain has no URDF."""
+    """Raised for a chain file that cannot be written or read or has an invalid value, or a chain without a URDF."""
 
 
 def save_chain(chain: Chain, path: Path) -> None:
-    """Write a chain; the file is replaced as a whole or not at all.
+    """Write a chain; replaces the file atomically.
 
     Raises:
         ChainFileError: the file cannot be written.
@@ -64,7 +64,7 @@ def load_chain(path: Path) -> Chain:
     """Read a chain.
 
     Raises:
-        ChainFileError: the file is missing, is not YAML, or lacks or misstates a value; the text names it.
+        ChainFileError: the file is missing, is not YAML, or lacks or misstates a value; the message names the value.
     """
     try:
         data = files.read_yaml(path, aliases=False)
@@ -137,15 +137,15 @@ def _numbers(values: Any, what: str, count: int) -> FloatArray:
 
 
 def to_urdf(chain: Chain, body: str) -> str:
-    """The chain as an XML text: a link for each target, in the target's own frame, the root target first.
+    """The chain as URDF: a link per target, in the target's own frame, the root target first.
 
-    A revolute joint for each angle, ``<angle>_<body>`` as in the ``joint_states`` of :data:`setup.BODY`, which move it.
-    Between the joints of one are empty links, ``<angle>_link``; a fixed joint, ``<joint>_mounting``, leads from the
-    last one to the child target. There are no masses, which nobody measured.
+    A revolute joint per angle, named ``<angle>_<body>`` as in the ``joint_states`` of :data:`setup.BODY`. Empty links
+    ``<angle>_link`` connect the revolute joints of one joint; a fixed joint ``<joint>_mounting`` leads from the last
+    one to the child target. Masses are not measured, so there are none.
 
     Raises:
-        ChainFileError: a name with other characters than letters, digits and underscores, or one that two links or
-            joints would have.
+        ChainFileError: a name with characters other than letters, digits and underscores, or a name used twice among
+            the links or the joints.
     """
     robot = ElementTree.Element("robot", name=body)
     for target in chain.targets:
@@ -187,7 +187,7 @@ def _connect(
 
 
 def _roll_pitch_yaw(rotation: FloatArray) -> FloatArray:
-    """(3,) radians: URDF turns by ``Rz(yaw) @ Ry(pitch) @ Rx(roll)``."""
+    """(3,) radians, in URDF's convention ``Rz(yaw) @ Ry(pitch) @ Rx(roll)``."""
     level = float(np.hypot(rotation[0, 0], rotation[1, 0]))
     pitch = np.arctan2(-rotation[2, 0], level)
     if level < 1e-9:

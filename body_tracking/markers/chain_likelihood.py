@@ -1,7 +1,7 @@
 """Maximum likelihood of the joints of a tree from measured poses (Gaschler 2011, eq. 5.5 and 5.20).
 
-The unknowns are the joints' parameters and the posture of each frame. Both are adjusted together, so that the errors of
-both targets of a joint count, each by its covariance; the frames are eliminated one by one (Schur complement), so that
+The unknowns are the joints' parameters and the posture of each frame. They are adjusted together, so that the errors of
+both targets of a joint count, each by its covariance. The frames are eliminated one by one (Schur complement), so that
 time grows linearly with their number.
 """
 
@@ -30,33 +30,33 @@ from body_tracking.markers.pose_table import PoseTable
 REACH: Final = 1.0
 """Metres: standard deviation of a joint's centre before any measurement; no target is mounted farther away."""
 _LOOSE: Final = 1e-6
-"""Information that a coordinate of a posture has before any measurement, so that one that nobody sees can be solved."""
+"""Prior information of a coordinate of a posture, so that a coordinate that no target shows stays solvable."""
 _LEAST: Final = 1e-12
-"""The same as a share of the largest information in the frame, beside which it has to survive rounding."""
+"""Prior information as a share of the frame's largest information, above which rounding errors stay."""
 _ITERATIONS: Final = 100
 _CONVERGED: Final = 1e-8
 """Relative decrease of the cost that ends the iteration."""
 _SETTLING: Final = 12
 _LOST: Final = 10.0
-"""Times the usual squared error of a frame."""
+"""Factor on the usual squared error of a frame, above which its posture is discarded as not converged."""
 _ROUNDING: Final = 1e-14
-"""Share of the largest eigenvalue of an information that rounding errors make of zero."""
+"""Share of the largest eigenvalue to which rounding errors raise a zero eigenvalue of an information matrix."""
 _BLOCKS: Final = 12
-"""Parts of a recording over which errors that exceed the poses' noise are taken as independent."""
+"""Parts of a recording whose sums of errors are independent, where errors exceed the poses' noise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Likelihood:
-    """The adjusted joints.
+    """The result of the adjustment.
 
     Attributes:
-        tree: with joints by their conventions, each with its own covariance.
+        tree: with joints in their conventional form, each with its covariance.
         posture: of each frame.
-        covariance: (12 j, 12 j) of all joints' parameters together, by the noise of the poses.
-        sensitivity: (12 j, q) derivative of them by what the poses of all frames share.
+        covariance: (12 j, 12 j) of all joints' parameters together, from the noise of the poses.
+        sensitivity: (12 j, q) derivative of the joints' parameters by the shared parameters of the poses.
         errors: (n, m, 6) of the measured poses against the adjusted ones.
         scale: root of the reduced chi squared: the size of the errors in units of the poses' noise.
-        iterations: that were needed.
+        iterations: number used.
     """
 
     tree: Tree
@@ -74,10 +74,10 @@ class _Normal:
 
     Attributes:
         information: (p, p).
-        gradients: (n, p) what each frame pulls the parameters by.
+        gradients: (n, p) each frame's contribution to the gradient.
         frames: (n, f, f) Cholesky factors of the frames' own information.
         mixed: (n, f, p) and
-        pulls: (n, f): to find the frames' steps from those of the parameters.
+        pulls: (n, f) mixed information and right sides, which give the frames' steps from that of the parameters.
     """
 
     information: FloatArray
@@ -95,9 +95,9 @@ def maximise(tree: Tree, poses: PoseTable, misfit: float, shared: FloatArray | N
     Args:
         tree: with joints near the solution.
         poses: of the tree's targets.
-        misfit: from which :attr:`Likelihood.scale` on the errors are no longer the poses' noise: the covariance is then
-            that of the errors as they are, correlated over time.
-        shared: (n, m, 6, q) derivative of the poses by q parameters that are wrong by the same in all frames, those of
+        misfit: threshold of :attr:`Likelihood.scale` above which the errors exceed the poses' noise: the covariance is
+            then that of the actual errors, which are correlated over time.
+        shared: (n, m, 6, q) derivative of the poses by q parameters with a constant error in all frames, i.e. those of
             the cameras' calibration.
     """
     posture = first_posture(tree, poses)
@@ -138,7 +138,7 @@ def maximise(tree: Tree, poses: PoseTable, misfit: float, shared: FloatArray | N
 
 
 def settled(tree: Tree, posture: Posture, poses: PoseTable) -> Posture:
-    """The posture of each frame by itself nearest to the measured poses (Levenberg and Marquardt's method)."""
+    """Posture of each frame, fitted to its measured poses alone (Levenberg-Marquardt)."""
     damping = np.full(len(poses), 1e-3)
     for _ in range(_SETTLING):
         rotations, translations = place(tree, posture)
@@ -165,7 +165,7 @@ def settled(tree: Tree, posture: Posture, poses: PoseTable) -> Posture:
 
 
 def _found(tree: Tree, poses: PoseTable, posture: Posture) -> BoolArray:
-    """(n,) whether a frame's posture is found, and not lost because a target between others is not seen."""
+    """(n,) whether a frame's posture has converged; a hidden target between visible ones can prevent it."""
     squares = _frame_squares(poses, errors(poses, *place(tree, posture)))
     whole = poses.seen.all(axis=1)
     usual = np.median(squares[whole]) if whole.any() else np.median(squares)
@@ -176,7 +176,7 @@ def _found(tree: Tree, poses: PoseTable, posture: Posture) -> BoolArray:
 def _stated(
     tree: Tree, posture: Posture, poses: PoseTable, misfit: float, shared: FloatArray | None, iterations: int
 ) -> Likelihood:
-    """The joints by their conventions, with their covariance and sensitivity."""
+    """The joints in their conventional form, with their covariance and sensitivity."""
     made = [conventional(joint) for joint in tree.joints]
     tree, posture = reseated(tree, posture, [joint for joint, _ in made])
     rotations, translations = place(tree, posture)
@@ -184,7 +184,7 @@ def _stated(
     directions = _directions(tree)
     normal = _normal(tree, posture, poses, directions, error)
     parameters = directions.shape[1]
-    # a coordinate that no target of a frame shows counts neither as known nor as unknown
+    # a coordinate that no target of a frame shows is not a degree of freedom
     shown = np.linalg.eigvalsh(normal.frames @ normal.frames.swapaxes(-1, -2)) > 1e3 * _LOOSE
     freedom = 6 * int(poses.seen.sum()) - int(shown.sum()) - parameters
     scale = float(np.sqrt(_squares(poses, error) / max(freedom, 1)))
@@ -211,10 +211,10 @@ def _covariance(
 ) -> FloatArray:
     """(p, p) covariance of the parameters.
 
-    The information that the adjusted postures give is too large by what their own errors make of it: a joint that is
-    never turned about an axis seems to turn about it by the noise. To second order the surplus is half the second
-    derivative of the information by the postures, times the covariance of these. Where it is all there is, the
-    parameter's covariance is that before the measurement (:data:`REACH`).
+    The information from the adjusted postures is too large, because the postures' own errors contribute to it: a joint
+    that never turns about an axis seems to turn about it by the noise. To second order the surplus is half the second
+    derivative of the information by the postures, times their covariance. Where the surplus is all the information, the
+    parameter keeps its prior covariance (:data:`REACH`).
     """
     prior, _ = _prior(tree, directions)
     surplus = np.zeros_like(prior)
@@ -234,7 +234,7 @@ def _covariance(
     variances = 1.0 / (np.maximum(values, 0.0) / scale**2 + before)
     whitened = np.diag(variances)
     if scale > 1.0:
-        # errors that last: each part of the recording as it pulls (Huber's sandwich with blocks), beside scaled noise
+        # correlated errors: Huber's sandwich over blocks of the recording, added to the scaled noise
         parts = np.array_split(normal.gradients, min(_BLOCKS, len(poses)))
         pulls = (np.stack([part.sum(axis=0) for part in parts]) @ basis) * np.minimum(variances / scale**2, 1.0)
         whitened = whitened + pulls.T @ pulls
@@ -257,7 +257,7 @@ def _directions(tree: Tree) -> FloatArray:
 
 
 def _prior(tree: Tree, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(p, p) information and (p,) gradient of what is known of the joints before any measurement."""
+    """Prior information (p, p) of the joints and its gradient (p,)."""
     weights = np.tile(np.repeat([REACH**-2, np.pi**-2, REACH**-2, np.pi**-2], 3), len(tree.joints))
     centres = np.concatenate(
         [np.concatenate([joint.parent_centre, np.zeros(3), joint.child_centre, np.zeros(3)]) for joint in tree.joints]
@@ -266,7 +266,7 @@ def _prior(tree: Tree, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _cost(tree: Tree, posture: Posture, poses: PoseTable) -> tuple[float, FloatArray]:
-    """Sum of the squared errors, with the prior, and the errors themselves (n, m, 6)."""
+    """Sum of the squared errors including the prior, and the errors (n, m, 6)."""
     error = errors(poses, *place(tree, posture))
     centres = sum(
         float(joint.parent_centre @ joint.parent_centre + joint.child_centre @ joint.child_centre)
@@ -280,7 +280,7 @@ def _squares(poses: PoseTable, error: FloatArray) -> float:
 
 
 def _frame_squares(poses: PoseTable, error: FloatArray) -> FloatArray:
-    """(n,) sum of the squared errors (n, m, 6) of each frame, in units of their noise."""
+    """(n,) sum of the squared whitened errors (n, m, 6) of each frame."""
     white = (poses.whitening @ error[..., None])[..., 0]
     result: FloatArray = (white * white).sum(axis=(1, 2))
     return result
@@ -289,7 +289,7 @@ def _frame_squares(poses: PoseTable, error: FloatArray) -> FloatArray:
 def _normal(
     tree: Tree, posture: Posture, poses: PoseTable, directions: FloatArray, error: FloatArray | None
 ) -> _Normal:
-    """Normal equations; of no errors where these are None."""
+    """Normal equations; residuals are zero if ``error`` is None."""
     by_frame, by_joint = _derivatives(tree, posture, poses, directions, error)
     n, rows = by_frame.shape[:2]
     information = by_frame.swapaxes(-1, -2) @ by_frame
@@ -324,7 +324,7 @@ def _derivatives(
 def _sensitivity(
     tree: Tree, posture: Posture, poses: PoseTable, directions: FloatArray, normal: _Normal, shared: FloatArray
 ) -> FloatArray:
-    """(p, q) derivative of the adjusted parameters by what the poses share: the normal equations' right side by it."""
+    """(p, q) derivative of the adjusted parameters by the shared ones, from the right sides of the normal equations."""
     by_frame, by_joint = _derivatives(tree, posture, poses, directions, None)
     residual = (poses.whitening @ shared).reshape(len(poses), by_frame.shape[1], -1)
     solved = _solve(normal.frames, by_frame.swapaxes(-1, -2) @ residual)
@@ -334,7 +334,7 @@ def _sensitivity(
 
 
 def _solve(factors: FloatArray, right: FloatArray) -> FloatArray:
-    """Solutions of symmetric systems of which the Cholesky factors are given."""
+    """Solutions of symmetric systems from their Cholesky factors."""
     result: FloatArray = np.linalg.solve(factors.swapaxes(-1, -2), np.linalg.solve(factors, right))
     return result
 

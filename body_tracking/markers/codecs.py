@@ -28,7 +28,7 @@ from body_tracking.messages.images import array_to_image, image_to_array
 
 
 class CameraImage(Codec):
-    """An image of one brightness per pixel: stamp in nanoseconds, frame, (height, width) pixels."""
+    """A monochrome image: stamp in nanoseconds, frame, (height, width) pixels."""
 
     type_name = IMAGE
 
@@ -86,8 +86,8 @@ class SpacePoints(Codec):
 
 
 class Frames(Codec):
-    """Frames in another one, for ``tf2``: stamp in nanoseconds, that frame; of each frame its name, (3, 3) its rotation
-    and (3,) its origin in the other.
+    """Transforms for ``tf2``: stamp in nanoseconds, parent frame, and per child frame its name, (3, 3) rotation and
+    (3,) origin in the parent.
     """
 
     type_name = TF

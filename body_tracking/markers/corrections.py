@@ -1,4 +1,4 @@
-"""What the size of balls does to their images, and the calibration of the cameras to poses."""
+"""Effects of the balls' size on their images, and of the cameras' calibration on poses."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from body_tracking.markers.targets import Target
 
 
 def centred(rig: Rig, balls: Sequence[ImageBalls], points: Points, diameter: float) -> tuple[ImageBalls, ...]:
-    """The balls with their pixels moved from the centroids of their images to the projections of their centres.
+    """Balls with their pixels moved from the centroids of their images to the projections of their centres.
 
     Args:
-        rig: the cameras, of which the frames of ``balls`` name some.
-        balls: as they were found.
-        points: triangulated from them, for the depths; balls that are in no point stay.
+        rig: the cameras; contains the frames of ``balls``.
+        balls: detections.
+        points: triangulated from ``balls``, for the depths; balls without a point stay unchanged.
         diameter: of the balls, metres.
     """
     frames, moved = [camera.frame_id for camera in rig.cameras], []
@@ -39,10 +39,10 @@ def centred(rig: Rig, balls: Sequence[ImageBalls], points: Points, diameter: flo
 
 
 def pose_sensitivity(rig: Rig, target: Target, pose: TargetPose) -> FloatArray:
-    """How a pose moves when the calibration's parameters are larger and the pixels stay.
+    """Derivative of a pose by the calibration's parameters at fixed pixels.
 
-    As :func:`body_tracking.markers.triangulation.sensitivity`, for the pose that fits the pixels of all balls best,
-    each pixel as good as the other.
+    As :func:`body_tracking.markers.triangulation.sensitivity`, for the pose with the least squared reprojection error
+    of all balls, all pixels equally weighted.
 
     Returns:
         (6, p) in the order of :attr:`TargetPose.covariance`, per unit of each parameter of :class:`Rig`.
@@ -51,7 +51,7 @@ def pose_sensitivity(rig: Rig, target: Target, pose: TargetPose) -> FloatArray:
 
 
 def pose_sensitivities(rig: Rig, targets: Mapping[str, Target], poses: Sequence[TargetPose]) -> dict[str, FloatArray]:
-    """:func:`pose_sensitivity` of several targets at once, by their names."""
+    """:func:`pose_sensitivity` of several targets at once, by name."""
     starts, by_pose, points = _balls(targets, poses)
     firsts = np.append(starts, len(points))
     information, pull, start = np.zeros((len(poses), 6, 6)), np.zeros((len(poses), 6, rig.size)), 0
@@ -73,16 +73,16 @@ def _collect(
     information: FloatArray,
     pull: FloatArray,
 ) -> None:
-    """Add the normal equations of a camera's pixels: poses (t, 6, 6), and (t, 6, p) by the rig's parameters.
+    """Add the normal equations of one camera's pixels: of the poses (t, 6, 6), and mixed with the rig (t, 6, p).
 
     Args:
         firsts: (t + 1,) first ball of each target.
-        by_pose: (b, 3, 6) derivative of the balls by their poses,
-        by_point: (b, 2, 3) of the pixels by the balls,
-        by_parameters: (b, 2, q) and by the camera's own parameters,
-        start: of which this is the first in the rig.
-        information: is added to.
-        pull: is added to.
+        by_pose: (b, 3, 6) derivative of the balls by their poses.
+        by_point: (b, 2, 3) derivative of the pixels by the balls.
+        by_parameters: (b, 2, q) derivative of the pixels by the camera's own parameters.
+        start: index in the rig of the first of these parameters.
+        information: (t, 6, 6), updated.
+        pull: (t, 6, p), updated.
     """
     derivative = np.empty(6)
     for target in range(len(firsts) - 1):
@@ -102,7 +102,7 @@ def _collect(
 def calibration_effects(
     rig: Rig | None, targets: Mapping[str, Target], poses: Sequence[TargetPose]
 ) -> dict[str, FloatArray] | None:
-    """:func:`pose_sensitivities`; None without a rig, zeros for poses of points that the rig did not measure."""
+    """:func:`pose_sensitivities`; None without a rig, zeros for poses not measured by the rig."""
     if rig is None:
         return None
     if measured_by(rig, poses):
@@ -111,19 +111,19 @@ def calibration_effects(
 
 
 def measured_by(rig: Rig | None, poses: Sequence[TargetPose]) -> bool:
-    """Whether poses of one time are in the frame of the rig; those of another system's points are not."""
+    """Whether the poses of one time are in the rig's frame; poses from another system's points are not."""
     return rig is not None and all(pose.frame_id == rig.cameras[0].frame_id for pose in poses)
 
 
 def shape_effects(rig: Rig | None, targets: Mapping[str, Target], poses: Sequence[TargetPose]) -> dict[str, FloatArray]:
-    """What the errors of the targets' own geometry add to their poses, the same unknowns in all frames.
+    """Effects of the errors of the targets' own geometry on their poses; the errors are constant in all frames.
 
-    As :func:`pose_sensitivity`, for the pose that fits the pixels best; without a rig, or for poses of points that it
-    did not measure, for the pose that fits the points best, each coordinate as good as the other.
+    As :func:`pose_sensitivity`, for the pose with the least squared reprojection error; without a rig, or for poses not
+    measured by it, for the pose with the least squared distance of the points, all coordinates equally weighted.
 
     Returns:
-        Of each target (6, 3k) in the order of :attr:`TargetPose.covariance`: what independent unknowns of variance 1,
-        that make up :attr:`Target.covariance`, add.
+        By target, (6, 3k) in the order of :attr:`TargetPose.covariance`: effects of 3k independent unknowns of variance
+        1, into which :attr:`Target.covariance` is decomposed.
     """
     starts, by_pose, points = _balls(targets, poses)
     information, pull = np.zeros((len(poses), 6, 6)), np.zeros((len(points), 6, 3))
@@ -145,7 +145,7 @@ def shape_effects(rig: Rig | None, targets: Mapping[str, Target], poses: Sequenc
 
 
 def _balls(targets: Mapping[str, Target], poses: Sequence[TargetPose]) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Index of the first ball of each target, (b, 3, 6) derivatives of all balls by their poses, (b, 3) balls."""
+    """Index of the first ball of each target, (b, 3, 6) derivatives of all balls by their poses, (b, 3) positions."""
     turned = [targets[pose.name].points @ pose.rotation.T for pose in poses]
     counts = [len(each) for each in turned]
     arms = np.concatenate(turned)
@@ -155,7 +155,7 @@ def _balls(targets: Mapping[str, Target], poses: Sequence[TargetPose]) -> tuple[
 
 
 def prepare() -> None:
-    """Compile the loops, or load them: a target a metre before two cameras."""
+    """Compile the loops, or load them: a target one metre in front of two cameras."""
     target = Target("", np.eye(3), np.zeros((9, 9)))
     place = np.array([0.0, 0.0, 1.0])
     pose_sensitivity(parallel_cameras(), target, TargetPose("", 0, "", np.eye(3), place, np.eye(6), np.arange(3), 0.0))

@@ -1,7 +1,7 @@
 """The pruned depth-first search of Gaschler 2011, section 3.3.2: the baseline of :mod:`.recognition`.
 
-As published: one threshold for all distances, 5 mm, whatever the noise of a point; a queue of 30 edges, which is not
-complete; one target at a time; no pose of fewer than four balls; nothing says whether a second place fits as well.
+As published: one threshold of 5 mm for all distances, whatever the noise of a point; an incomplete search of 30 edges;
+one target at a time; no pose from fewer than four balls; no test whether a second place fits as well.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from body_tracking.core.skeleton import FloatArray, IntArray
 from body_tracking.markers.pose import umeyama
 
 THRESHOLD: Final = 0.005
-"""Average distance between points and target, metres, above which a matching is refused."""
+"""Average distance between points and target, metres, above which a matching is rejected."""
 QUEUE: Final = 30
-"""Edge correspondences that are tried."""
+"""Number of edge correspondences tried."""
 _PENALTY: Final = 1.5
 _FEWEST: Final = 4
 
@@ -28,7 +28,7 @@ class Matching:
     """A target among points.
 
     Attributes:
-        assignment: (k,) index of each ball among the points, -1 for one that is not matched.
+        assignment: (k,) index of the point of each ball, -1 for a ball without one.
         rotation: (3, 3) and
         translation: (3,) metres: a point x of the target is at ``rotation @ x + translation``.
         distance: average distance between the matched points and the target, metres.
@@ -56,7 +56,7 @@ def gaschler_depth_first(
         queue: number of edge correspondences.
 
     Returns:
-        None when no four balls are found.
+        None if fewer than four balls are found.
     """
     return _Search(target, points, threshold).best(queue)
 
@@ -78,7 +78,7 @@ class _Search:
         measured = np.array(list(combinations(range(len(self._points)), 2)))
         lengths = np.linalg.norm(self._target[own[:, 0]] - self._target[own[:, 1]], axis=1)
         distances = np.linalg.norm(self._points[measured[:, 0]] - self._points[measured[:, 1]], axis=1)
-        # two points fitted to two points: each is off by half of what the lengths differ by
+        # fitting two points to two points leaves each off by half the difference of the lengths
         off = 0.5 * np.abs(lengths[:, None] - distances)
         for place in np.argsort(off, axis=None)[:queue]:
             edge, pair = divmod(int(place), len(measured))
@@ -100,11 +100,11 @@ class _Search:
                 self._extend(larger)
 
     def _inliers(self, matches: dict[int, int]) -> list[tuple[int, int]]:
-        """Further matches that the present ones allow, the nearest first."""
+        """Further matches consistent with the present ones, the nearest first."""
         balls = [ball for ball in range(len(self._target)) if ball not in matches]
         seen, chosen = list(matches), list(matches.values())
         if len(matches) < 3:
-            # no rotation yet: by the distances to both ends of the edge
+            # no rotation yet: compare the distances to both ends of the edge
             wanted = np.linalg.norm(self._target[balls][:, None] - self._target[seen], axis=2)
             measured = np.linalg.norm(self._points[:, None] - self._points[chosen], axis=2)
             off = 0.5 * np.abs(wanted[:, None] - measured).max(axis=2)
@@ -124,7 +124,7 @@ class _Search:
         return rotation[0], translation[0]
 
     def _evaluate(self, matches: dict[int, int]) -> float:
-        """Average distance of a matching of three or more, which is kept when it is the best so far."""
+        """Average distance of a matching of three or more balls; keeps the matching if it is the best so far."""
         rotation, translation = self._fit(matches)
         model, measured = self._target[list(matches)], self._points[list(matches.values())]
         off = np.linalg.norm(measured - model @ rotation.T - translation, axis=1)

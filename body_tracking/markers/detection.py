@@ -1,9 +1,9 @@
 """Bright balls in an infrared image, with sub-pixel centroids and their covariance (Gaschler 2011, section 3.1).
 
-The threshold comes from quantiles of the brightness (section 3.1.2), the components from one pass. Each centroid
-is weighted by the brightness above the background around the ball (equation 3.2), over a window that goes beyond the
-threshold, so that the threshold cuts nothing off. What is not the image of one whole ball is explained by
-:mod:`body_tracking.markers.discs`.
+The threshold comes from quantiles of the brightness (section 3.1.2), the components from one pass. Each centroid is
+weighted by the brightness above the background around the ball (equation 3.2), over a window wider than the thresholded
+region, so that the threshold cuts nothing off. :mod:`body_tracking.markers.discs` explains regions that are not the
+image of one whole ball.
 """
 
 from __future__ import annotations
@@ -33,21 +33,21 @@ from body_tracking.markers.regions import (
 from body_tracking.markers.spheres import sphere_centre_correction as sphere_centre_correction
 
 _ROWS: Final = 4
-"""Every so many rows are in the histogram, as in section 3.1.2."""
+"""The histogram uses every fourth row, as in section 3.1.2."""
 _APART: Final = 5.0
-"""Pixels between the edges of balls that are near enough to disturb each other's centroids."""
+"""Pixels between the edges of balls, below which they disturb each other's centroids."""
 _TOGETHER: Final = 0.06
-"""Misfit up to which regions that are near to each other, or cut by the border, are one ball each."""
+"""Largest misfit at which neighbouring regions, or regions cut by the border, are taken for one ball each."""
 _FIT_FLOOR: Final = 0.004
-"""Standard deviation of a fitted centre without noise, pixels."""
+"""Standard deviation of a fitted disc's centre without noise, pixels."""
 _DISTURBED: Final = 0.05
-"""Standard deviation of a centroid by the light of a ball nearby, pixels."""
+"""Standard deviation of a centroid due to the light of a ball nearby, pixels."""
 _LOST: Final = 4.0
-"""Pixels of area by which the blur of an edge lowers :attr:`~body_tracking.markers.regions.Shapes.fill` at most."""
+"""Pixels of area by which edge blur lowers :attr:`~body_tracking.markers.regions.Shapes.fill` at most."""
 _ELONGATION_NOISE: Final = 4.0
-"""Elongation by noise, standard deviations of the centroid in radii of the ball."""
+"""Elongation due to noise, in standard deviations of the centroid in radii of the ball."""
 _QUANTISATION: Final = 1.0 / 12.0
-"""Variance of rounding to whole numbers."""
+"""Variance of rounding to integers."""
 _MOST: Final = 2**16 - 1
 
 
@@ -56,12 +56,12 @@ _Ball = tuple[FloatArray, float, FloatArray]
 
 
 class ImageError(BodyTrackingError):
-    """An array is not a grey image of 8 or 16 bits."""
+    """Raised for an array that is not a grey image of 8 or 16 bits."""
 
 
 @dataclass(frozen=True, slots=True)
 class DetectionSettings:
-    """How balls are found; each field's ``doc`` says what it is.
+    """Settings of the detection of balls; each field's ``doc`` describes it.
 
     Raises:
         ImageError: a value out of its range.
@@ -137,7 +137,7 @@ def detect(
         image: (h, w) uint8 or uint16.
         stamp_ns: capture time, nanoseconds.
         camera: its frame.
-        settings: how balls are found.
+        settings: of the detection.
 
     Raises:
         ImageError: another shape or type, or no pixels.
@@ -166,7 +166,7 @@ def detect(
     odd, cut = _odd(shapes, settings), ~components.inside[kept]
     groups = groups_of(np.ascontiguousarray(shapes.pixels), np.ascontiguousarray(shapes.areas), _APART)
     members = np.bincount(groups, minlength=len(groups))
-    # most regions are the image of one ball by itself
+    # most regions are the image of a single isolated ball
     plain = (members[groups] == 1) & ~odd & ~cut
     found: list[_Ball] = []
     dropped = len(areas) - 1 - len(kept)
@@ -200,17 +200,17 @@ def prepare() -> None:
     for kind in (np.uint8, np.uint16):
         image = cv2.GaussianBlur(drawn, (0, 0), 0.8).astype(kind)
         detect(image)
-        # an image in the memory of a message is another type to the compiler
+        # numba compiles read-only arrays, as images in a message's memory are, separately
         image.flags.writeable = False
         detect(image)
 
 
 @dataclass(frozen=True, slots=True)
 class _Histogram:
-    """What the brightness of a whole image says.
+    """Threshold and background from the brightness of a whole image.
 
     Attributes:
-        threshold: a pixel that is brighter is a ball's.
+        threshold: brighter pixels belong to balls.
         background: mean brightness.
         variance: of the background.
     """
@@ -239,12 +239,12 @@ def _odd(shapes: Shapes, settings: DetectionSettings) -> BoolArray:
 
 
 def _explained(regions: Regions, shapes: Shapes, members: IntArray, misfit: float) -> list[_Ball]:
-    """Centres, areas and covariances of the balls in regions; none where they are no balls."""
+    """Centres, areas and covariances of the balls in regions; empty if discs do not fit."""
     return _balls(explain(*regions.of(members), shapes.pixels[members]), misfit)
 
 
 def _balls(discs: Discs, misfit: float) -> list[_Ball]:
-    """Balls of discs; none where they fit worse."""
+    """Balls from discs; empty if the misfit is larger than allowed."""
     if discs.misfit > misfit:
         return []
     areas = np.pi * discs.radii**2

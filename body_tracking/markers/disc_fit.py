@@ -1,8 +1,8 @@
-"""Fits of discs with blurred edges to the pixels of a bright region, by the method of Levenberg and Marquardt.
+"""Levenberg-Marquardt fits of discs with blurred edges to the pixels of a bright region.
 
 A ball is a disc of one brightness with a blurred edge, A N((r - distance) / s) with N the normal distribution function.
-What hides a part of it is another disc or a straight edge, blurred by the same s: the share of a pixel that is inside
-both edges is the bivariate normal distribution function. The derivatives are analytic.
+Another disc or a straight edge, blurred by the same s, hides a part of it: the share of a pixel inside both edges is
+the bivariate normal distribution function. The derivatives are analytic.
 """
 
 from __future__ import annotations
@@ -16,35 +16,35 @@ from body_tracking.core.compiled import compiled
 from body_tracking.core.skeleton import FloatArray, IntArray
 
 OVERLAPPING: Final = 0
-"""Discs, the larger, which are nearer, before the smaller; parameters x, y, radius, brightness of each."""
+"""Discs, the larger (nearer) before the smaller; parameters x, y, radius, brightness of each."""
 CUT: Final = 1
 """A disc hidden on one side of a line; x, y, radius, brightness, angle of the line's normal, its distance."""
 MOVING: Final = 2
-"""A disc that moves while the shutter is open; x, y, radius, brightness, and the way in x and y."""
+"""A disc that moves during the exposure; x, y, radius, brightness, displacement in x and y."""
 
 _ITERATIONS: Final = 30
 _ROUNDS: Final = 10
-"""Of Lloyd's method."""
+"""Rounds of Lloyd's method."""
 _HOPELESS: Final = 200.0
-"""Weighted sum of squares by which a model is so much worse than another one that nothing of it counts."""
+"""Difference of weighted sums of squares at which the worse model has no chance."""
 _EXPECTED_EDGE: Final = 0.8
-"""Standard deviation of the edge's blur, pixels: the expected value and"""
+"""Standard deviation of the edge's blur, pixels: expected value,"""
 _EDGE_RANGE: Final = 0.4
-"""what it may differ by."""
+"""and the standard deviation of its prior."""
 _LEAST_EDGE: Final = 0.2
 _MOST_EDGE: Final = 4.0
 _LEAST_RADIUS: Final = 0.7
 _LEAST_BRIGHT: Final = 0.05
 _MOST_BRIGHT: Final = 30.0
-"""Brightness of a ball, in that of the region, which saturates."""
+"""Largest brightness of a saturated ball, relative to the region's."""
 _INSTANTS: Final = 7
-"""Of the time that the shutter is open."""
+"""Sampled instants of the exposure."""
 _BLURRED: Final = 4.0
-"""Standard deviations of the blur by which discs must be apart not to hide each other."""
+"""Distance in standard deviations of the blur at which discs do not hide each other."""
 _FAR: Final = 4.0
 """Standard deviations beyond which the normal distribution function is 0 or 1, within 3e-5."""
 _STRAIGHT: Final = 0.999
-"""Correlation of two edges at most."""
+"""Largest correlation of two edges."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
 _B1, _B2, _B3, _B4, _B5 = 0.319381530, -0.356563782, 1.781477937, -1.821255978, 1.330274429
 _ROOT_2PI: Final = math.sqrt(2.0 * math.pi)
@@ -67,16 +67,16 @@ def _clear(values: FloatArray) -> None:
 
 @compiled
 def both(u: float, share_u: float, density_u: float, v: float, correlation: float) -> tuple[float, float, float, float]:
-    """Share of a blurred point that is within two straight edges: the bivariate normal distribution function.
+    """Share of a blurred point within two straight edges: the bivariate normal distribution function.
 
-    By the integral of Drezner and Wesolowsky (1990) over the angle whose sine is the correlation.
+    Drezner and Wesolowsky's (1990) integral over the angle whose sine is the correlation.
 
     Args:
         u: distance within the first edge, in standard deviations of the blur.
-        share_u: :func:`normal` of it, and
-        density_u: its density.
+        share_u: distribution function at u (:func:`normal`).
+        density_u: density at u.
         v: distance within the second edge.
-        correlation: of the two, the cosine between the edges' normals.
+        correlation: of the two distances, the cosine between the edges' normals.
 
     Returns:
         The share, and its derivatives by u, v and the correlation.
@@ -102,7 +102,9 @@ def both(u: float, share_u: float, density_u: float, v: float, correlation: floa
 def _by_edge(
     slope: float, disc: int, inside: float, normal_x: float, normal_y: float, edge: float, to: FloatArray
 ) -> None:
-    """Add a slope times the derivatives of a disc's distance within its edge, by its parameters and the edge's log."""
+    """Add slope times the derivatives of the scaled distance within a disc's edge by its parameters and the edge's
+    log.
+    """
     by_distance = slope / edge
     to[4 * disc] += by_distance * normal_x
     to[4 * disc + 1] += by_distance * normal_y
@@ -121,7 +123,7 @@ def _by_cosine(
     other_y: float,
     to: FloatArray,
 ) -> None:
-    """Add a slope times the derivatives of the cosine between a disc's normal and another, by the disc's centre."""
+    """Add slope times the derivatives of the cosine between a disc's normal and another one by the disc's centre."""
     cross = normal_x * other_y - normal_y * other_x
     to[4 * disc] += slope * normal_y * cross / distance
     to[4 * disc + 1] -= slope * normal_x * cross / distance
@@ -138,7 +140,7 @@ def _overlapping(
     own: FloatArray,
     gradient: FloatArray,
 ) -> float:
-    """Brightness at a pixel, and its gradient (p,); places (k, 4) and own (p,) are room to work in."""
+    """Brightness at a pixel, and its gradient (p,); places (k, 4) and own (p,) are buffers."""
     total = 0.0
     _clear(gradient)
     for rank in range(len(order)):
@@ -253,12 +255,12 @@ def brightness(
         kind: of the model.
         x: of the pixel.
         y: of the pixel.
-        p: (p,) parameters of the model, the last of which is the log of the edge.
+        p: (p,) parameters of the model; the last is the log of the edge.
         edge: standard deviation of the blur, ``exp(p[-1])``.
         order: (k,) discs of an overlapping model, the nearest first.
         places: (k, 4) and
-        own: (p,) room to work in, for an overlapping model.
-        gradient: (p,) derivatives by the parameters, which are written here.
+        own: (p,) buffers for an overlapping model.
+        gradient: (p,) derivatives by the parameters, written.
     """
     if kind == OVERLAPPING:
         return _overlapping(x, y, p, edge, order, places, own, gradient)
@@ -274,7 +276,7 @@ def _linear(
     information: FloatArray,
     pull: FloatArray,
 ) -> tuple[float, float]:
-    """Weighted and plain sums of squared differences; information (p, p) and pull (p,) are written."""
+    """Weighted (with the prior) and plain sums of squares; writes information (p, p) and pull (p,)."""
     size = len(p)
     order = np.zeros(size // 4, dtype=np.int64)
     for i in range(1, len(order)):
@@ -313,7 +315,7 @@ def _linear(
 
 @compiled
 def _solve(information: FloatArray, damping: float, pull: FloatArray, lower: FloatArray, step: FloatArray) -> None:
-    """Write the step of a damped Gauss-Newton method, by Cholesky's factor, which is written too."""
+    """Write the step of a damped Gauss-Newton method and the Cholesky factor it uses."""
     size = len(pull)
     for i in range(size):
         step[i] = pull[i]
@@ -336,7 +338,7 @@ def _solve(information: FloatArray, damping: float, pull: FloatArray, lower: Flo
 
 @compiled
 def clusters(x: FloatArray, y: FloatArray, weights: FloatArray, count: int, along: FloatArray) -> FloatArray:
-    """Centres (count, 2) of clusters by Lloyd's method, from an even spread along a direction.
+    """Centres (count, 2) of clusters by Lloyd's method, initially spread evenly along a direction.
 
     Args:
         x: (n,) of the pixels.
@@ -375,18 +377,18 @@ def clusters(x: FloatArray, y: FloatArray, weights: FloatArray, count: int, alon
 def fit(
     kind: int, start: FloatArray, pixels: FloatArray, ceiling: float, rival: float
 ) -> tuple[FloatArray, FloatArray, float, float]:
-    """The most likely parameters of a model.
+    """Maximum likelihood parameters of a model.
 
     Args:
         kind: of the model.
-        start: (p - 1,) its parameters but for the edge's.
+        start: (p - 1,) initial parameters without the edge's.
         pixels: (4, n) x, y, brightness and its variance, of each pixel.
         ceiling: brightness at which the sensor saturates.
-        rival: weighted sum of squares of another model of these pixels; infinite where there is none. The fit ends
-            where it would stay far worse even if each further iteration gained as much as the last one.
+        rival: weighted sum of squares of another model of these pixels; infinite without one. The fit ends early if the
+            rival would stay far better even if each further iteration gained as much as the last one.
 
     Returns:
-        The parameters (p,), their information (p, p), the weighted sum of squared differences and the plain one.
+        Parameters (p,), their information (p, p), weighted and plain sums of squared differences.
     """
     size = len(start) + 1
     found = np.empty(size)

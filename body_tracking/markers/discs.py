@@ -1,7 +1,7 @@
-"""Bright regions that are not one whole ball: balls that overlap, a ball that something hides in part or that moved.
+"""Bright regions that are not one whole ball: overlapping balls, a partly hidden ball, or a moving one.
 
-The models of :mod:`body_tracking.markers.disc_fit` are fitted to the pixels of a region, and the one with the least
-information criterion (Schwarz 1978) is taken.
+The models of :mod:`body_tracking.markers.disc_fit` are fitted to the pixels of a region; Schwarz's information
+criterion (1978) selects one.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from body_tracking.core.skeleton import FloatArray
 from body_tracking.markers.disc_fit import CUT, MOVING, OVERLAPPING, clusters, fit
 
 MOST_DISCS: Final = 4
-"""That are fitted together."""
+"""Largest number of discs fitted together."""
 _MISFIT: Final = 0.01
-"""Of the models, share of the brightness: a ball is not equally bright all over."""
+"""Model error, share of the brightness: a ball is not equally bright all over."""
 _ROUND: Final = 0.01
-"""Radii by which the centre of a disc that the border cuts is off: there a ball's image is no circle, but an ellipse,
-20 degrees off the axis longer than wide by 7 %."""
+"""Error of the centre of a disc cut by the border, in radii: near the border a ball's image is an ellipse, 7 % longer
+than wide at 20 degrees off the axis."""
 _LEAST_GAP: Final = 0.25
-"""Radii between the centres of discs that are two."""
+"""Smallest distance between two discs' centres, in radii."""
 _CONVINCING: Final = 1.0
-"""Weighted sum of squares over the number of pixels of a model that needs no rival."""
+"""Weighted sum of squares per pixel below which no other model is tried."""
 _COMPACT: Final = 1.1
-"""Ratio of the axes up to which a region is as wide as it is long; half overlapping balls have 1.3."""
+"""Ratio of the axes below which a region counts as round; half overlapping balls have 1.3."""
 _EXPLAINED: Final = 0.06
-"""Misfit from which on no more discs are tried."""
+"""Misfit below which no more discs are tried."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,9 +39,9 @@ class Discs:
         centres: (k, 2) pixels.
         radii: (k,) pixels.
         covariance: (k, 2, 2) of the centres, pixels squared.
-        misfit: root of the mean squared difference between the image and the model, share of the brightness.
-        squares: weighted sum of squares over the number of pixels.
-        criterion: Schwarz's, of models of the same region the least is the best.
+        misfit: root mean square difference between the image and the model, share of the brightness.
+        squares: weighted sum of squares per pixel.
+        criterion: Schwarz's; among models of one region the least is best.
     """
 
     centres: FloatArray
@@ -58,7 +58,7 @@ def explain(pixels: FloatArray, ceiling: float, starts: FloatArray) -> Discs:
     Args:
         pixels: (4, n) x, y, brightness above the background, and its variance by noise.
         ceiling: brightness above the background at which the sensor saturates.
-        starts: (k, 2) pixels inside the balls where so many are known to be, or their common centroid.
+        starts: (k, 2) pixels inside the balls if several are known, else their common centroid.
     """
     pixels, ceiling = _scaled(pixels, ceiling)
     x, y, values, _ = pixels
@@ -76,18 +76,18 @@ def explain(pixels: FloatArray, ceiling: float, starts: FloatArray) -> Discs:
         return min((discs.squares for discs in (*overlap.values(), *single)), default=np.inf) * len(x)
 
     def try_discs(count: int) -> Discs:
-        # discs that share a part of their area
+        # 1.5: overlapping discs have more area than the region
         radius = np.sqrt(1.5 * area / np.pi / count)
         overlap[count] = _several(clusters(x, y, weights, count, along), radius, pixels, ceiling, least())
         return overlap[count]
 
-    # what is as wide as it is long is three balls rather than two
+    # a round region is more likely three balls than two
     for count in (2,) if lengths[0] > _COMPACT * lengths[1] else (3, 2):
         if try_discs(count).squares < _CONVINCING:
             return overlap[count]
     way = np.sqrt(12.0 * (lengths[0] ** 2 - lengths[1] ** 2)) * along
     single.append(_single(MOVING, [*middle, 2.0 * lengths[1], 1.0, *way], pixels, ceiling, least()))
-    # the flat side of a disc that is cut is opposite to its tail; where it is small noise decides
+    # the flat side of a cut disc is opposite its tail; where the third moment is small, noise decides
     for hidden in (-np.copysign(1.0, lopsided) * across, np.copysign(1.0, lopsided) * across):
         whole = 2.0 * lengths[0]
         centre = middle + 0.3 * whole * hidden
@@ -103,7 +103,7 @@ def explain(pixels: FloatArray, ceiling: float, starts: FloatArray) -> Discs:
     best = min((*overlap.values(), *single), key=lambda discs: discs.criterion)
     if best not in single:
         return best
-    # what the model may be wrong by: the centres by the others, each by its probability
+    # uncertainty of the model: spread of the single models' centres, weighted by their probabilities
     odds = np.exp(-0.5 * np.array([min(discs.criterion - best.criterion, 100.0) for discs in single]))
     apart = np.stack([discs.centres[0] - best.centres[0] for discs in single])
     between = (odds[:, None] * apart).T @ apart / odds.sum()
@@ -111,10 +111,10 @@ def explain(pixels: FloatArray, ceiling: float, starts: FloatArray) -> Discs:
 
 
 def cut_by_border(pixels: FloatArray, ceiling: float) -> Discs:
-    """The ball of a region that the image's border cuts, of which at least half is seen.
+    """The ball of a region cut by the image's border, at least half of it visible.
 
     Args:
-        pixels: as of :func:`explain`.
+        pixels: as in :func:`explain`.
         ceiling: brightness above the background at which the sensor saturates.
     """
     pixels, ceiling = _scaled(pixels, ceiling)
@@ -125,7 +125,7 @@ def cut_by_border(pixels: FloatArray, ceiling: float) -> Discs:
 
 
 def _scaled(pixels: FloatArray, ceiling: float) -> tuple[FloatArray, float]:
-    """Pixels and saturation in the brightness of the region, with the variance of what the models are wrong by."""
+    """Pixels and saturation in units of the region's brightness; the variance includes the model error."""
     x, y, values, variance = pixels
     bright = max(float(np.percentile(values, 95)), 1e-9)
     return np.stack([x, y, values / bright, variance / bright**2 + _MISFIT**2]), ceiling / bright
@@ -142,7 +142,7 @@ def _shape(x: FloatArray, y: FloatArray, weights: FloatArray) -> tuple[FloatArra
 
 
 def _several(starts: FloatArray, radius: float, pixels: FloatArray, ceiling: float, rival: float = np.inf) -> Discs:
-    """Discs that overlap or are near to each other, from centres (k, 2) and a common radius."""
+    """Discs that overlap or are close together, from initial centres (k, 2) and a common radius."""
     count = len(starts)
     start = np.array([number for place in starts for number in (*place, radius, 1.0)])
     found, covariance, *quality = _fit(OVERLAPPING, start, pixels, ceiling, rival)
@@ -157,7 +157,7 @@ def _several(starts: FloatArray, radius: float, pixels: FloatArray, ceiling: flo
 
 
 def _single(kind: int, start: list[float], pixels: FloatArray, ceiling: float, rival: float) -> Discs:
-    """One disc, whose centre and radius are the first three parameters of the model."""
+    """One disc; the first three parameters of the model are its centre and radius."""
     found, covariance, *quality = _fit(kind, np.array(start), pixels, ceiling, rival)
     return Discs(found[None, :2], found[2:3], covariance[None, :2, :2], *quality)
 
@@ -165,7 +165,7 @@ def _single(kind: int, start: list[float], pixels: FloatArray, ceiling: float, r
 def _fit(
     kind: int, start: FloatArray, pixels: FloatArray, ceiling: float, rival: float
 ) -> tuple[FloatArray, FloatArray, float, float, float]:
-    """Parameters (p,), their covariance (p, p), and the qualities of :class:`Discs`."""
+    """Parameters (p,), their covariance (p, p), and misfit, squares and criterion of :class:`Discs`."""
     found, information, squares, plain = fit(kind, start, pixels, ceiling, rival)
     size, count = len(found), pixels.shape[1]
     inverse: FloatArray = np.asarray(np.linalg.pinv(information + 1e-9 * np.eye(size), hermitian=True), np.float64)

@@ -1,4 +1,4 @@
-"""Whether targets can be distinguished, and each of them from itself rotated."""
+"""Check that targets can be distinguished from each other, and each from a rotated copy of itself."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from body_tracking.markers.recognition import SURE, check_targets
 from body_tracking.markers.targets import Target
 
 SEPARATION: Final = 6.0
-"""Deviations of the noise between two interpretations: the wrong one is the likelier in 1.3e-3 of the frames, within
-the margin that recognition demands in 1 %."""
+"""Separation of two interpretations in standard deviations of the noise: the wrong one is likelier in 1.3e-3 of the
+frames, and within recognition's margin in 1 %."""
 
 
 class TargetsAlikeError(BodyTrackingError):
-    """Raised when two targets, or a target and itself rotated, cannot be distinguished."""
+    """Raised when two targets, or a target and a rotated copy of itself, cannot be distinguished."""
 
 
 def check_distinct(targets: Sequence[Target], noise: float, hidden: int = 1) -> None:
-    """Refuse targets that recognition would mistake for each other.
+    """Reject targets that recognition would confuse.
 
-    Two targets are too alike when balls of the one lie on balls of the other, turned and moved as fits best, within the
-    noise. A target is too much like itself when that is so for its balls in another order: an equilateral triangle, a
-    square, a flat target that is its own mirror image. Each ball counts with the noise and with the covariances of both
-    targets.
+    Two targets are too alike when balls of one coincide, after the best rigid alignment, with balls of the other within
+    the noise. A target is too much like itself when its balls coincide with themselves in another order: an equilateral
+    triangle, a square, a flat target that is its own mirror image. The noise and the mean variances of both targets add
+    up for each ball.
 
     Args:
         targets: all that are used together.
-        noise: standard deviation of a measured point, metres; of the largest one, along the line of sight.
-        hidden: balls that may be hidden of a target that has at least four others.
+        noise: standard deviation of a measured point in its worst direction, the line of sight, metres.
+        hidden: number of balls that may be hidden in a target that has at least four others.
 
     Raises:
-        TargetsAlikeError: the text names the pair, the balls and the distance.
+        TargetsAlikeError: the message names the pair, the balls and the distance.
         RecognitionError: invalid targets.
     """
     check_targets(targets)
@@ -81,10 +81,9 @@ def _check(target: Target, other: Target, noise: float, hidden: int) -> None:
 
 
 def _maps(model: FloatArray, points: FloatArray, limit: float) -> Iterator[tuple[int, ...]]:
-    """All ways to lay the balls on different points whose distances differ by no more than the limit allows.
+    """All injective maps of the balls to points whose distances differ by no more than the limit allows.
 
-    Points that are off by e in the root of the sum of their squares change a distance by the root of two times e at
-    most.
+    If the root of the sum of the points' squared errors is e, a distance changes by at most sqrt(2) e.
     """
     wanted = np.linalg.norm(model[:, None] - model, axis=2)
     given = np.linalg.norm(points[:, None] - points, axis=2)

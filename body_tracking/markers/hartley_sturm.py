@@ -1,7 +1,7 @@
-"""The optimal correction of a pair of corresponding pixels (Hartley and Sturm 1997; Gaschler 3.2.3).
+"""Optimal correction of a pair of corresponding pixels (Hartley and Sturm 1997; Gaschler 3.2.3).
 
-Of all pairs that meet the epipolar constraint it is the nearest in the two images, the maximum likelihood for noise
-that is equal in both and in all directions. It is global: all six roots of the polynomial are tried.
+The corrected pair is the nearest one in the two images that satisfies the epipolar constraint: the maximum likelihood
+for equal isotropic noise. The solution is global: all six roots of the polynomial are tried.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from body_tracking.core.compiled import compiled
 from body_tracking.core.skeleton import FloatArray
 
 _POLISH: Final = 2
-"""Newton steps on the roots: a leading coefficient near zero (an epipole far away) costs the eigenvalues digits."""
+"""Newton steps on the roots: a leading coefficient near zero (a distant epipole) makes the eigenvalues inaccurate."""
 _LEADING: Final = 1e-10
 _NEWTON: Final = 4
 _ON_EPIPOLE: Final = 1e-9
-"""Distance from the epipole, in units of the image's size, below which a pixel is on it."""
+"""Distance from the epipole, in units of the image's size, below which a pixel counts as on it."""
 _PARABOLA: Final = 0.03
-"""Relative size below which terms that bend the parabola are small enough for its minimum to be the only one."""
+"""Relative size of the terms beyond the parabola, below which its minimum is the only one."""
 
 
 def fundamental(
@@ -31,9 +31,9 @@ def fundamental(
 
     Args:
         rotations: (2, 3, 3) and
-        translations: (2, 3) of the rig.
-        focal: (2, 2) and
-        centre: (2, 2) pixels, of images without distortion.
+        translations: (2, 3) of the cameras in the rig.
+        focal: (2, 2) focal lengths and
+        centre: (2, 2) principal points, pixels, of undistorted images.
 
     Returns:
         F (3, 3) with ``x2 @ F @ x1 = 0`` for homogeneous pixels, and the epipoles (3,) in the first and second image.
@@ -54,7 +54,7 @@ def fundamental(
 def correct(
     matrix: FloatArray, epipoles: tuple[FloatArray, FloatArray], first: FloatArray, second: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Move pairs of pixels least so that they correspond exactly.
+    """Move pairs of pixels by the least distance so that they satisfy the epipolar constraint.
 
     Gaschler (2011): figures 3.3-3.4; eq. 3.6-3.12.
 
@@ -67,7 +67,7 @@ def correct(
     Returns:
         (n, 2) and (n, 2) corrected pixels.
     """
-    # a unit of the size of the image keeps the polynomial's coefficients near each other
+    # scaled by the size of the image, the polynomial's coefficients have similar magnitudes
     unit = 1.0 + max(np.abs(first).max(initial=0.0), np.abs(second).max(initial=0.0))
     scale = np.array([unit, unit, 1.0])
     matrix, a_epipole, b_epipole = matrix * scale * scale[:, None], epipoles[0] / scale, epipoles[1] / scale
@@ -79,7 +79,7 @@ def correct(
 def _corrected(
     matrix: FloatArray, a_epipole: FloatArray, b_epipole: FloatArray, first: FloatArray, second: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """:func:`correct`, of pixels in a unit of the size of the image."""
+    """:func:`correct` for pixels in units of the image's size."""
     one, other = np.empty_like(first), np.empty_like(second)
     for n in range(len(first)):
         (x1, y1), (x2, y2) = first[n], second[n]
@@ -95,7 +95,7 @@ def _corrected(
         size = max(abs(a), abs(b), abs(c), abs(d))
         a, b, c, d = a / size, b / size, c / size, d / size
         t, finite = _minimum(a, b, c, d, f, g)
-        # eq. 3.11; for an infinite t its direction
+        # eq. 3.11; an infinite t has only a direction
         p, q = a * t + b * finite, c * t + d * finite
         one[n, 0], one[n, 1] = _nearest(t * f, finite, -t, cos1, sin1, x1, y1)
         other[n, 0], other[n, 1] = _nearest(-g * q, p, q, cos2, sin2, x2, y2)
@@ -108,7 +108,7 @@ def _frame(x: float, y: float, epipole: FloatArray) -> tuple[float, float, float
     across, along = epipole[0] - epipole[2] * x, epipole[1] - epipole[2] * y
     length = math.hypot(across, along)
     least = _ON_EPIPOLE * abs(epipole[2])
-    if length < least:  # a pixel on the epipole: any direction does
+    if length < least:  # pixel on the epipole: the direction is arbitrary
         return 1.0, 0.0, epipole[2] / least
     length = max(length, 1e-300)
     return across / length, along / length, epipole[2] / length
@@ -116,11 +116,11 @@ def _frame(x: float, y: float, epipole: FloatArray) -> tuple[float, float, float
 
 @compiled
 def _minimum(a: float, b: float, c: float, d: float, f: float, g: float) -> tuple[float, float]:
-    """Where the cost C(t) is least: t and 1, or 1 and 0 for an infinite t.
+    """Minimum of the cost C(t): (t, 1), or (1, 0) for an infinite t.
 
-    The cost is at most that of t = 0, the line through the first pixel, which bounds the size of t. Where the pixels
-    are near their epipolar lines against the distance to the epipoles, the cost is a parabola within that bound, and
-    Newton's method finds its one minimum; all roots are computed for the others.
+    The cost is at most that of t = 0, the line through the first pixel, which bounds |t|. Where the pixels are near
+    their epipolar lines compared with the distance to the epipoles, the cost is nearly a parabola within that bound,
+    and Newton's method finds its one minimum; otherwise all roots are computed.
     """
     coefficients = _polynomial(a, b, c, d, f, g)
     start = d * d / (b * b + g * g * d * d)
@@ -200,7 +200,7 @@ def _roots(coefficients: FloatArray) -> FloatArray:
 
 @compiled
 def _nearest(l0: float, l1: float, l2: float, cosine: float, sine: float, x: float, y: float) -> tuple[float, float]:
-    """The point of a line that is nearest to the origin of a pixel's frame, as a pixel."""
+    """Point of a line nearest to the origin of a pixel's frame, as a pixel."""
     scale = l0 * l0 + l1 * l1
     across, along = -l0 * l2 / scale, -l1 * l2 / scale
     return cosine * across - sine * along + x, sine * across + cosine * along + y

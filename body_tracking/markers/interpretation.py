@@ -1,8 +1,8 @@
-"""Choice among several interpretations of the points as targets, or the result that it is ambiguous.
+"""Selection among several interpretations of the points as targets, or the finding that they are ambiguous.
 
-The cost of a way to see a target is minus twice the logarithm of its likelihood, but for a constant: the squared
-Mahalanobis distance of its points, and a fixed amount for each ball that is not seen. A point is a ball of one target
-at most, so the targets that compete for points are judged together.
+The cost of a candidate (assignment of points to a target's balls) is minus twice its log likelihood, up to a constant:
+the squared Mahalanobis distance of its points, plus a fixed amount for each unseen ball. A point belongs to at most one
+target, so targets that compete for points are judged together.
 """
 
 from __future__ import annotations
@@ -22,39 +22,39 @@ from body_tracking.markers.search import Deadline
 from body_tracking.markers.targets import Target
 
 HIDDEN_COST: Final = 20.0
-"""Cost of a ball that is not seen: a point of three dimensions is worse with a probability of 1.7e-4."""
+"""Cost of an unseen ball: a point's squared Mahalanobis distance, 3 degrees of freedom, exceeds it with p = 1.7e-4."""
 MARGIN: Final = 9.0
-"""By how much the cost of a second interpretation must be larger: a ratio of the likelihoods of 90."""
+"""Least extra cost of a second interpretation: a likelihood ratio of 90."""
 BELIEVED_MARGIN: Final = 40.0
-"""The same for a second interpretation at another place with as many balls that chance does not explain: hardly ever is
-one of them the target and the other nothing, however well they fit."""
+"""Least extra cost of a second interpretation at another place with as many balls that chance does not explain: rarely
+is one of the two the target and the other nothing, however well each fits."""
 MISSED: Final = 1e-4
-"""Share of right assignments that the test of their fit refuses."""
+"""Share of correct assignments that the chi-square test rejects."""
 MAX_CHANCE: Final = 1e-3
-"""Ways to see a target expected by chance alone, above which one is not believed (the number of false alarms of
-Desolneux, Moisan and Morel 2000)."""
+"""Number of candidates expected by chance, above which a candidate is rejected (number of false alarms, Desolneux,
+Moisan and Morel 2000)."""
 _SAME: Final = 0.1
-"""Two poses are one interpretation when no ball differs by more than this part of the target's size."""
+"""Two poses are one interpretation if no ball differs by more than this share of the target's size."""
 _BATCH: Final = 50
-"""Fits between two looks at the clock, half a millisecond."""
+"""Fits between two checks of the deadline, half a millisecond."""
 _MOST: Final = 6
-"""Ways to see one target that are compared with those of the others."""
+"""Candidates of one target that are compared with those of the other targets."""
 _MAX_COMBINATIONS: Final = 20_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """A way to see a target.
+    """A candidate: an assignment of points to a target's balls, with its pose.
 
     Attributes:
-        assignment: for each ball its point, -1 for one that is not seen.
+        assignment: for each ball the index of its point, -1 if unseen.
         rotation: (3, 3).
         translation: (3,) metres.
         covariance: (6, 6) of the pose.
         residual: metres.
         chi_square: of the fit.
-        cost: larger for what is less likely.
-        balls: (k, 3) where the balls are by the pose, metres.
+        cost: larger for a less likely candidate.
+        balls: (k, 3) positions of all balls by the pose, metres.
     """
 
     assignment: tuple[int, ...]
@@ -74,9 +74,9 @@ def fitted(
     deadline: Deadline,
     missed: float = MISSED,
 ) -> list[Candidate]:
-    """Those of the assignments whose points fit the target, each with its pose.
+    """The assignments whose points fit the target, with their poses, the lowest cost first.
 
-    A part of an assignment that fits is left out: the same with a ball less. Balls nearly on one line give no pose.
+    A part of an assignment that fits is dropped. Balls nearly on one line determine no pose.
     """
     return fitted_together([(target, assignments)], points, deadline, missed)[0]
 
@@ -87,7 +87,7 @@ def fitted_together(
     deadline: Deadline,
     missed: float = MISSED,
 ) -> list[list[Candidate]]:
-    """:func:`fitted` of several targets, whose poses are computed at once: a call costs more than its numbers."""
+    """:func:`fitted` for several targets in one batch: a call costs more than its arithmetic."""
     by_size: dict[int, list[_Fitting]] = {}
     for place, (target, assignments) in enumerate(wanted):
         for assignment in dict.fromkeys(assignments):
@@ -112,7 +112,7 @@ def fitted_together(
 
 
 class _Fitting(NamedTuple):
-    """An assignment to be fitted: of which of the targets, its balls that are seen, the point of each ball."""
+    """An assignment to be fitted: index of its target, target, its visible balls, the point of each ball."""
 
     place: int
     target: Target
@@ -121,20 +121,20 @@ class _Fitting(NamedTuple):
 
     @property
     def matches(self) -> frozenset[tuple[int, int]]:
-        """Balls with their points."""
+        """Pairs of ball and point."""
         return frozenset((ball, self.assignment[ball]) for ball in self.seen)
 
 
 @lru_cache(maxsize=4096)
 def _determined(target: Target, seen: tuple[int, ...]) -> bool:
-    """Whether these balls of a target are not nearly on one line."""
+    """Whether these balls of a target are not nearly collinear."""
     return spread(target.points[list(seen)])
 
 
 def _fit(
     points: Points, fittings: Sequence[_Fitting], known_shape: bool, missed: float
 ) -> Iterator[tuple[_Fitting, Candidate]]:
-    """Of assignments of as many balls each, those that fit."""
+    """The assignments that fit, among ones with equally many balls."""
     size = len(fittings[0].seen)
     chosen = np.array([[each.assignment[ball] for ball in each.seen] for each in fittings])
     fits = maximum_likelihood(
@@ -162,19 +162,19 @@ def _fit(
 
 
 def expected_by_chance(target: Target, points: Points, candidate: Candidate, poses: float | None = None) -> float:
-    """How many ways to see a target that fit at least as well to expect of points that have nothing to do with it.
+    """Expected number of candidates that fit at least as well among points unrelated to the target.
 
-    Of points with a density of q per cubic metre, independent of each other, the sets of m points within a squared
-    Mahalanobis distance c of a pose among a volume U of poses are ``q^m U V sqrt(det S / det P)``: V the volume of the
-    ball of radius ``sqrt(c)`` in 3m - 6 dimensions, S the covariance of the points, and P that of the pose. The density
-    is that of the other points within the size of the target, and of one more.
+    For independent points with a density of q per cubic metre, the expected number of sets of m points within a squared
+    Mahalanobis distance c of a pose in a volume U of poses is ``q^m U V sqrt(det S / det P)``: V the volume of the ball
+    of radius ``sqrt(c)`` in 3m - 6 dimensions, S the covariance of the points, and P that of the pose. The density is
+    that of the other points within the target's size around it, plus one point.
 
     Args:
         target: of the candidate.
         points: of the frame.
         candidate: with three balls or more.
-        poses: m^3 rad^3, the volume of the poses at which the target may be; when None, all rotations (8 pi^2) at as
-            many cubic metres as the points would fill at that density.
+        poses: m^3 rad^3, volume of the target's possible poses; None for all rotations (8 pi^2) times the volume that
+            the points fill at that density.
     """
     balls = [ball for ball, point in enumerate(candidate.assignment) if point >= 0]
     chosen = np.array(candidate.assignment)[balls]
@@ -199,7 +199,7 @@ def expected_by_chance(target: Target, points: Points, candidate: Candidate, pos
 
 
 def spread(points: FloatArray, least: float = 0.1) -> bool:
-    """Whether points are wider across their longest direction than this part of their length along it."""
+    """Whether the second principal width of points exceeds this share of the first."""
     widths = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(widths[1] > least * widths[0])
 
@@ -207,14 +207,14 @@ def spread(points: FloatArray, least: float = 0.1) -> bool:
 def decide(
     candidates: dict[str, list[Candidate]], believed: Callable[[str, Candidate], bool]
 ) -> tuple[dict[str, Candidate], set[str]]:
-    """The likeliest way to see the targets, and the targets for which a second way is nearly as likely.
+    """The likeliest combination of candidates, and the targets with a second, nearly as likely candidate.
 
     Args:
         candidates: by target, the likeliest first.
-        believed: whether chance does not explain a candidate of a target.
+        believed: whether a target's candidate is too unlikely to arise by chance.
 
     Returns:
-        The candidates of the targets that are certain, and the names of those that are not.
+        The candidates of the certain targets, and the names of the uncertain ones.
     """
     chosen: dict[str, Candidate] = {}
     unsure: set[str] = set()
@@ -228,7 +228,7 @@ def decide(
         for name in names:
             own = best[name]
             if own is None:
-                # seen as something else, though not for sure
+                # it has candidates, but the best combination uses none of them
                 unsure.add(name)
                 continue
             others = [(choice[name], cost) for choice, cost in combinations if cost < least + BELIEVED_MARGIN]
@@ -244,12 +244,12 @@ def decide(
 def _rivals(
     own: Candidate, other: Candidate | None, more: float, name: str, believed: Callable[[str, Candidate], bool]
 ) -> bool:
-    """Whether another way to see the target, at so much more cost, makes it uncertain."""
+    """Whether another candidate, at this extra cost, makes the target uncertain."""
     if other is None:
         return more < MARGIN
     if other is own or _same(own, other):
         return False
-    # of the same points, the likelihoods tell; points at another place need an explanation, too
+        # candidates of shared points compare by likelihood; a candidate of other points needs an explanation of its own
     shared = len(set(own.assignment) & set(other.assignment) - {-1})
     fewer = other.assignment.count(-1) > own.assignment.count(-1)
     return more < MARGIN or (shared < FEWEST and not fewer and believed(name, other))
@@ -261,7 +261,7 @@ def _same(first: Candidate, second: Candidate) -> bool:
 
 
 def _competing(candidates: dict[str, list[Candidate]]) -> list[list[str]]:
-    """Groups of targets that want the same points, directly or by others."""
+    """Groups of targets that compete for points, directly or through other targets."""
     groups: list[tuple[list[str], set[int]]] = []
     for name, each in candidates.items():
         if not each:
@@ -278,7 +278,7 @@ def _competing(candidates: dict[str, list[Candidate]]) -> list[list[str]]:
 
 
 def _combinations(candidates: dict[str, list[Candidate]]) -> list[tuple[dict[str, Candidate | None], float]]:
-    """All ways to see targets that use each point once at most, with their costs; a target may be seen nowhere."""
+    """All combinations of candidates without shared points, with their costs; None for a target without a candidate."""
     results: list[tuple[dict[str, Candidate | None], set[int], float]] = [({}, set(), 0.0)]
     for name, each in candidates.items():
         nowhere = HIDDEN_COST * len(each[0].assignment)

@@ -1,17 +1,17 @@
-"""A joint between two targets: its kind, its frames in both of them, and the covariance of these.
+"""A joint between two targets: kind, frames in both targets, covariance.
 
 A joint has a frame in its parent target and one in its child target, with the same origin, the joint's centre. A child
-target whose joint is turned by Q has the rotation ``R_child = R_parent @ parent_rotation @ Q @ child_rotation.T``
-(Gaschler 2011, eq. 5.1 and 5.15; his C_1 and C_2 are the two frames). By its kind, Q is
+target's rotation for a joint rotation Q is ``R_child = R_parent @ parent_rotation @ Q @ child_rotation.T``
+(Gaschler 2011, eq. 5.1 and 5.15; his C_1 and C_2 are the two frames). Q depends on the kind:
 
 - ball: any rotation. Both frames are parallel to those of the targets (Gaschler section 5.1).
 - hinge: ``Rz(a)``, about the z axis of both frames.
 - universal: ``Rz(a) @ Rx(-90 deg) @ Rz(b)``: a about the z axis of the frame in the parent, then b about the z axis of
   the frame in the child; the two axes are perpendicular and meet.
 
-What the motion does not determine is fixed by convention (Gaschler section 5.2.2): the x axis of each frame lies in the
-plane of its z axis and the origin of its target and points away from that origin, which makes the zero position; the
-centre of a hinge is where the sum of the squared distances to both origins is least.
+Conventions fix what the motion does not determine (Gaschler section 5.2.2): the x axis of each frame lies in the plane
+of its z axis and the target's origin and points away from that origin, which defines the zero position; the centre of a
+hinge minimises the sum of the squared distances to both origins.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ SIZE: Final = 12
 """Parameters of a joint: centre and rotation in the parent, centre and rotation in the child, three numbers each."""
 _CENTRES: Final = [0, 1, 2, 6, 7, 8]
 _NEAR_AXIS: Final = 0.01
-"""Metres: a target whose origin is nearer to the axis gets its x axis from an axis of its own instead."""
+"""Metres: if the target's origin is nearer to the axis, the target's own axes define the x axis."""
 _AXES: FloatArray = np.eye(3)[None]
 _STEP: Final = 1e-6
 _QUARTER: FloatArray = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -41,11 +41,11 @@ _HALF: FloatArray = np.diag([1.0, -1.0, -1.0])
 
 
 class JointError(BodyTrackingError):
-    """A joint, its name or its numbers are invalid."""
+    """Raised for an invalid joint, name or number."""
 
 
 class JointKind(StrEnum):
-    """What a joint lets its child do."""
+    """The joint's degrees of freedom."""
 
     BALL = "ball"
     HINGE = "hinge"
@@ -59,23 +59,23 @@ class JointKind(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Joint:
-    """A joint and how sure it is.
+    """A joint and its covariance.
 
     Attributes:
         name: of letters, digits and underscores.
         parent: name of the target before the joint.
-        child: name of the target behind it.
-        kind: see the module's text.
+        child: name of the target behind the joint.
+        kind: see the module's docstring.
         parent_rotation: (3, 3) the joint's axes in the parent target.
         parent_centre: (3,) metres, in the parent target.
         child_rotation: (3, 3) the joint's axes in the child target.
         child_centre: (3,) metres, in the child target.
-        covariance: (12, 12) of parent centre, parent rotation, child centre, child rotation; a rotation's three are w
-            such that the true one is ``exp(w) @ rotation``. The conventions of the module's text are in it: what they
-            fix has no variance of its own, what they derive (the zero position) has that of what it is derived from.
+        covariance: (12, 12) of parent centre, parent rotation, child centre, child rotation; a rotation's three entries
+            are w such that the true rotation is ``exp(w) @ rotation``. It includes the conventions: fixed quantities
+            have no variance, derived ones (the zero position) inherit that of their sources.
 
     Raises:
-        JointError: an invalid name, wrong shapes, numbers that are not finite, matrices that are no rotations.
+        JointError: an invalid name, wrong shapes, numbers that are not finite, matrices that are not rotations.
     """
 
     name: str
@@ -108,7 +108,7 @@ class Joint:
 
     @property
     def angle_names(self) -> tuple[str, ...]:
-        """Names of its angles; those of a ball joint are about x, y and z, one after the other (intrinsic)."""
+        """Names of the angles; a ball joint's are intrinsic rotations about x, y and z."""
         endings = {JointKind.BALL: ("_x", "_y", "_z"), JointKind.HINGE: ("",), JointKind.UNIVERSAL: ("_1", "_2")}
         return tuple(self.name + ending for ending in endings[self.kind])
 
@@ -123,7 +123,7 @@ class Joint:
         return self.child_rotation[:, 2]
 
     def changed(self, step: FloatArray) -> Joint:
-        """The joint whose parameters are larger by (12,), as in :attr:`covariance`."""
+        """The joint with a step (12,) added to its parameters, in the order of :attr:`covariance`."""
         return replace(
             self,
             parent_centre=self.parent_centre + step[:3],
@@ -133,7 +133,7 @@ class Joint:
         )
 
     def difference(self, other: Joint) -> FloatArray:
-        """(12,) the step by which ``other.changed(step)`` is this joint."""
+        """(12,) step such that ``other.changed(step)`` is this joint."""
         turns = np.stack([self.parent_rotation @ other.parent_rotation.T, self.child_rotation @ other.child_rotation.T])
         parent, child = so3.rotation_vectors(turns)
         return np.concatenate(
@@ -146,11 +146,13 @@ def is_rotation(matrix: FloatArray) -> bool:
     return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() < 1e-6 and np.linalg.det(matrix) > 0.0)
 
 
-# --- how a joint turns: Q of the module's text, for n frames
+# --- joint rotations: Q of the module's docstring, for n frames
 
 
 def turn_axes(kind: JointKind, turns: FloatArray) -> FloatArray:
-    """(n, 3, d) axes of the coordinates in the frame in the parent, of (n, 3, 3) turns; (1, 3, 3) for a ball joint."""
+    """(n, 3, d) axes of the coordinates in the parent's joint frame, for (n, 3, 3) turns; (1, 3, 3) for a ball
+    joint.
+    """
     if kind is JointKind.BALL:
         return _AXES
     axes = np.zeros((len(turns), 3, kind.coordinates))
@@ -169,7 +171,7 @@ def turn_angles(kind: JointKind, turns: FloatArray) -> FloatArray:
 
 
 def nearest_turns(kind: JointKind, rotations: FloatArray) -> FloatArray:
-    """(n, 3, 3) turns that the joint can make, near to (n, 3, 3) rotations of the child's frame in the parent's."""
+    """(n, 3, 3) turns possible for the joint, nearest to (n, 3, 3) rotations of the child's frame in the parent's."""
     if kind is JointKind.BALL:
         return rotations
     angles = turn_angles(kind, rotations)
@@ -188,13 +190,14 @@ def about_z(angles: FloatArray) -> FloatArray:
     return result
 
 
-# --- what the motion determines, and what the conventions fix
+# --- parameters that the motion determines, and those fixed by convention
 
 
 def free_directions(joint: Joint) -> FloatArray:
-    """(12, p) the directions of the parameters that a motion can determine: p is 6 (ball), 9 (hinge), 10 (universal).
+    """(12, p) directions of the parameters that a motion can determine; p is 6 (ball), 9 (hinge), 10 (universal).
 
-    A hinge's centre may move along the axis, in both targets together; a frame may turn about its z axis.
+    Undetermined are a shift of a hinge's centre along its axis, in both targets together, and a turn of a frame about
+    z.
     """
     if joint.kind is JointKind.BALL:
         return np.eye(SIZE)[:, _CENTRES]
@@ -210,14 +213,14 @@ def free_directions(joint: Joint) -> FloatArray:
 
 
 def conventional(joint: Joint) -> tuple[Joint, FloatArray]:
-    """The same joint by the conventions of the module's text, and what they make of its free directions.
+    """The joint in its conventional form, and the derivative of its parameters by its free directions.
 
-    The axis is given the sign that makes its largest component in the parent (for the second axis of a universal joint,
-    in the child) positive.
+    The sign of the axis makes its largest component positive, in the parent, or for the second axis of a universal
+    joint in the child.
 
     Returns:
-        The joint, its covariance untouched.
-        (12, p) derivative of its parameters by steps along :func:`free_directions` of it.
+        The joint, with unchanged covariance.
+        (12, p) derivative of its parameters by steps along its :func:`free_directions`.
     """
     if joint.kind is JointKind.BALL:
         return joint, free_directions(joint)
@@ -251,7 +254,7 @@ def _across(axis: FloatArray, centre: FloatArray) -> float:
 
 
 def _shifted(joint: Joint) -> Joint:
-    """A hinge's centre where the sum of the squared distances to both origins is least."""
+    """Move a hinge's centre to the least sum of squared distances to both origins."""
     if joint.kind is not JointKind.HINGE:
         return joint
     shift = -0.5 * (joint.parent_centre @ joint.parent_axis + joint.child_centre @ joint.child_axis)
@@ -275,9 +278,9 @@ def axis_frame(axis: FloatArray, centre: FloatArray, near_axis: bool = False) ->
 
     Args:
         axis: (3,) unit vector.
-        centre: (3,) a point on it, seen from the target's origin.
-        near_axis: whether the x axis is to lie in the plane of the axis and the target's own axis that is farthest
-            from it, because the target's origin lies on the axis.
+        centre: (3,) a point on it, relative to the target's origin.
+        near_axis: whether the target's origin lies on the axis: then the x axis lies in the plane of the z axis and
+            that target axis that is farthest from it.
     """
     towards = np.eye(3)[np.abs(axis).argmin()] if near_axis else centre
     y = np.cross(axis, towards)

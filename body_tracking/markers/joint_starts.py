@@ -1,7 +1,7 @@
 """Joints in closed form, from the relative poses of two targets (Gaschler 2011, sections 5.1.1 and 5.2.3).
 
-For the centres these are the least squares of SCoRE, for the axis those of SARA (Ehrig et al., J. Biomech. 39 (2006)
-2798 and 40 (2007) 2150).
+The centres are the least squares of SCoRE, the axis that of SARA (Ehrig et al., J. Biomech. 39 (2006) 2798 and 40
+(2007) 2150).
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from body_tracking.markers.joint_model import SIZE, Joint, JointKind, axis_frame
 def closed_form(
     name: str, parent: str, child: str, kind: JointKind, rotations: FloatArray, translations: FloatArray
 ) -> Joint:
-    """A joint, without covariance.
+    """A joint in closed form, without covariance.
 
     Args:
         name: of the joint.
-        parent: name of the target before it.
-        child: name of the target behind it.
+        parent: name of the target before the joint.
+        child: name of the target behind the joint.
         kind: of the joint.
         rotations: (n, 3, 3) and
-        translations: (n, 3) metres: the poses of the child in the parent.
+        translations: (n, 3) metres: poses of the child in the parent.
     """
     parent_centre, child_centre = centres(rotations, translations, kind is JointKind.HINGE)
     parent_rotation, child_rotation = np.eye(3), np.eye(3)
@@ -43,11 +43,11 @@ def centres(rotations: FloatArray, translations: FloatArray, along_axis: bool) -
 
     Args:
         rotations: (n, 3, 3) of the child in the parent.
-        translations: (n, 3) likewise, metres.
-        along_axis: whether the centre may lie anywhere along an axis: the weakest direction is left out, which gives
-            the solution with the least norm (Gaschler eq. 5.10).
+        translations: (n, 3) of the child in the parent, metres.
+        along_axis: whether the centre may lie anywhere along an axis: the weakest direction is dropped, which gives the
+            minimum norm solution (Gaschler eq. 5.10).
     """
-    # of the normal equations, which are small however many frames there are
+    # normal equations: their size does not depend on the number of frames
     n = len(rotations)
     total, mean = rotations.sum(axis=0), translations.sum(axis=0)
     matrix = np.block([[n * np.eye(3), -total], [-total.T, n * np.eye(3)]])
@@ -72,8 +72,8 @@ def universal_axes(rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The first axis in the parent and the second one in the child, (3,) unit vectors, from rotations (n, 3, 3).
 
     The axes are perpendicular in every frame: a1 . R_i a2 = 0, linear in the products of their components. The null
-    space of that is exact where the motion is large; where it is small it is one of the starts all over the half sphere
-    from which the sum of the squares, quadratic in either axis, is minimised for both in turn.
+    space of this system is exact for large motions; for small ones it is one of several starts over the half sphere,
+    from which alternating minimisation over either axis minimises the sum of squares.
     """
     flat = rotations.reshape(-1, 9)
     moments = flat.T @ flat

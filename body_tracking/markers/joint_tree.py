@@ -1,7 +1,7 @@
-"""A tree of targets that joints connect: its posture, and how that depends on coordinates and parameters.
+"""A tree of targets connected by joints: postures, and their derivatives by coordinates and parameters.
 
-The coordinates of a posture are the root target's pose (translation, then a rotation w: ``exp(w) @ rotation``) and
-those of each joint, in their order: turns about :func:`body_tracking.markers.joint_model.turn_axes`.
+The coordinates of a posture are the root target's pose (translation, then a rotation w: ``exp(w) @ rotation``), then
+each joint's, in the order of the joints: rotations about :func:`body_tracking.markers.joint_model.turn_axes`.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from body_tracking.markers.joint_model import (
 from body_tracking.markers.pose_table import PoseTable
 
 ROOT: Final = 6
-"""Coordinates of the root target's pose."""
+"""Number of coordinates of the root target's pose."""
 
 
 class TreeError(BodyTrackingError):
-    """Joints that do not connect targets to one tree."""
+    """Raised for joints that do not connect the targets to one tree."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tree:
-    """The order of a tree.
+    """Structure of a tree.
 
     Attributes:
         targets: names, the root first.
-        joints: each after that of its parent.
-        parents: for each joint the index of its parent among the targets; its child has the joint's own index plus one.
-        slices: for each joint its coordinates.
+        joints: each after its parent.
+        parents: for each joint the index of its parent target; the index of its child target is the joint's plus one.
+        slices: for each joint the slice of its coordinates.
         size: number of coordinates.
     """
 
@@ -51,7 +51,7 @@ class Tree:
     size: int
 
     def with_joints(self, joints: Sequence[Joint]) -> Tree:
-        """The same tree with joints of other numbers."""
+        """The tree with other values of its joints."""
         return replace(self, joints=tuple(joints))
 
 
@@ -62,7 +62,7 @@ class Posture:
     Attributes:
         rotation: (n, 3, 3) and
         translation: (n, 3) metres: the root target's pose.
-        turns: for each joint (n, 3, 3).
+        turns: for each joint (n, 3, 3) joint rotations.
     """
 
     rotation: FloatArray
@@ -70,15 +70,15 @@ class Posture:
     turns: tuple[FloatArray, ...]
 
     def arrays(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Copies of the three, the turns as (j, n, 3, 3)."""
+        """Copies of rotation, translation and turns, the turns as (j, n, 3, 3)."""
         return np.array(self.rotation, order="C"), np.array(self.translation, order="C"), np.stack(self.turns)
 
 
 def tree_of(joints: Sequence[Joint]) -> Tree:
-    """The tree that joints make, whatever order they come in.
+    """The tree of the joints, given in any order.
 
     Raises:
-        TreeError: no joint, a name twice, a target with two parents, a circle, or several trees.
+        TreeError: no joint, a duplicate name, a target with two parents, a cycle, or several trees.
     """
     names = [joint.name for joint in joints]
     angle_names = [name for joint in joints for name in joint.angle_names]
@@ -108,10 +108,10 @@ def tree_of(joints: Sequence[Joint]) -> Tree:
 
 
 def first_posture(tree: Tree, poses: PoseTable, previous: Posture | None = None) -> Posture:
-    """Postures near to measured poses: the first seen target of each frame keeps its pose.
+    """Postures near measured poses: the first visible target of each frame keeps its pose.
 
-    Where a target is not seen, its joints are turned as in the nearest frame in which they are seen, else as in the
-    previous posture, else as at zero.
+    Joints of a hidden target keep their rotations from the nearest frame with both targets visible, else from the
+    previous posture, else zero.
     """
     n = len(poses)
     seen = poses.seen
@@ -132,7 +132,7 @@ def first_posture(tree: Tree, poses: PoseTable, previous: Posture | None = None)
     posture = Posture(np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), tuple(turns))
     if seen[:, 0].all():
         return replace(posture, rotation=poses.rotations[:, 0], translation=poses.translations[:, 0])
-    # the whole tree is moved so that the first seen target is where it was measured
+    # move the whole tree so that the first visible target is at its measured pose
     rotations, translations = place(tree, posture)
     frames, anchor = np.arange(n), seen.argmax(axis=1)
     rotation = poses.rotations[frames, anchor] @ rotations[frames, anchor].swapaxes(-1, -2)
@@ -148,7 +148,7 @@ def _zero(kind: JointKind) -> FloatArray:
 
 @lru_cache(maxsize=8)
 def numbers_of(tree: Tree) -> tree_loops.Numbers:
-    """The numbers of a tree, as loops need them."""
+    """Parameters of a tree as arrays for the compiled loops."""
     joints = tree.joints
     return (
         np.array(tree.parents),
@@ -170,14 +170,14 @@ def place(tree: Tree, posture: Posture) -> tuple[FloatArray, FloatArray]:
 
 
 def moved(tree: Tree, posture: Posture, steps: FloatArray) -> Posture:
-    """Postures further by (n, size) steps of their coordinates."""
+    """Postures after (n, size) steps of their coordinates."""
     rotation, translation, turns = posture.arrays()
     tree_loops.moved(numbers_of(tree), np.ascontiguousarray(steps), rotation, translation, turns)
     return Posture(rotation, translation, tuple(turns))
 
 
 def reseated(tree: Tree, posture: Posture, joints: Sequence[Joint]) -> tuple[Tree, Posture]:
-    """The same motion by joints whose frames are turned about z, shifted along it, or have it flipped."""
+    """The same motion with joint frames turned about z, shifted along z, or with z flipped."""
     turns = tuple(
         nearest_turns(
             new.kind, new.parent_rotation.T @ old.parent_rotation @ turns @ old.child_rotation.T @ new.child_rotation
@@ -192,9 +192,9 @@ def differentiate(tree: Tree, posture: Posture, rotations: FloatArray, parameter
 
     Args:
         tree: with j joints.
-        posture: n of them.
-        rotations: of :func:`place`.
-        parameters: whether those of the joints are wanted.
+        posture: n postures.
+        rotations: from :func:`place`.
+        parameters: whether to differentiate by the joints' parameters, too.
 
     Returns:
         (n, m, 6, size + 12 j) of translation and rotation (w of ``exp(w) @ rotation``) by the coordinates, then by the
@@ -208,7 +208,7 @@ def differentiate(tree: Tree, posture: Posture, rotations: FloatArray, parameter
 
 
 def errors(poses: PoseTable, rotations: FloatArray, translations: FloatArray) -> FloatArray:
-    """(n, m, 6) translation and rotation (w of ``exp(w) @ rotation``) from the tree's poses to those that are seen."""
+    """(n, m, 6) translation and rotation (w of ``exp(w) @ rotation``) from the tree's poses to the measured ones."""
     result = np.empty((*rotations.shape[:2], 6))
     tree_loops.errors(poses.rotations, poses.translations, poses.seen, rotations, translations, result)
     return result

@@ -1,8 +1,8 @@
 """Single joints between two targets from a recording of both (Gaschler 2011, sections 5.1 and 5.2).
 
-A closed form (:mod:`body_tracking.markers.joint_starts`) starts the maximum likelihood adjustment
-(:mod:`body_tracking.markers.chain_likelihood`). A fit states its quality: standard deviations grow as the motion
-gets smaller, and a verdict with warnings says when the motion was too small, about one axis only, or not of the joint's
+A closed form (:mod:`body_tracking.markers.joint_starts`) initialises the maximum likelihood adjustment
+(:mod:`body_tracking.markers.chain_likelihood`). A fit states its quality: smaller motions give larger standard
+deviations, and a verdict with warnings reports a motion that is too small, about one axis only, or not of the joint's
 kind.
 """
 
@@ -26,25 +26,25 @@ from body_tracking.markers.observations import TargetPose
 from body_tracking.markers.pose_table import PoseTable, pose_table
 
 MIN_FRAMES: Final = 10
-"""Frames in which both targets are seen."""
+"""Least number of frames with both targets."""
 SMALL_MOTION: Final = np.radians(5.0)
-"""RMS of the rotation from its mean; a range of +-9 deg evenly filled. Below it errors are ten times those of a full
-range, and what disturbs all frames alike (calibration, soft tissue) is no longer small beside the motion."""
+"""RMS of the rotation from its mean; corresponds to an evenly filled range of +-9 deg. Below it, errors are ten times
+those of a full range, and constant errors (calibration, soft tissue) are no longer small compared with the motion."""
 ONE_AXIS: Final = 0.1
-"""Share of the second principal rotation in the first."""
+"""Ratio of the second principal rotation to the first, below which the motion is about one axis."""
 MISFIT_WARNING: Final = 1.3
 MISFIT: Final = 3.0
-"""Errors in units of the poses' noise from which on the poses do not fit the joint."""
+"""Errors in units of the poses' noise, above which the poses do not fit the joint."""
 NOT_RIGID: Final = 3.0
-"""Distances of balls from their target in units of their noise from which on the target is not rigid."""
+"""RMS distance of balls from their target in units of their noise, above which the target is not rigid."""
 
 
 class JointFitError(BodyTrackingError):
-    """Too few frames in which both targets are seen, or sequences of different lengths."""
+    """Raised for too few frames with both targets, or sequences of different lengths."""
 
 
 class Verdict(StrEnum):
-    """What a fit is worth, the worst that applies last."""
+    """Quality of a fit; the enum's order is from best to worst."""
 
     GOOD = "good"
     SMALL_MOTION = "small_motion"
@@ -66,14 +66,14 @@ class JointFit:
 
     Attributes:
         joint: with its covariance.
-        frames: that were used.
+        frames: number used.
         motion: (3,) radians: RMS rotation of the child in the parent about the three principal axes of the motion, from
-            its mean, the largest first, without the part of the poses' noise.
+            its mean, the largest first, without the contribution of the poses' noise.
         scale: root of the reduced chi squared: errors in units of the poses' noise.
-        gap: metres: RMS distance between the centre as the parent has it and as the child has it.
-        turn: radians: RMS of the rotation that the joint cannot make; 0 for a ball joint.
+        gap: metres: RMS distance between the centre by the parent's pose and by the child's.
+        turn: radians: RMS of the rotation that the joint does not permit; 0 for a ball joint.
         verdict: the worst that applies.
-        warnings: a line for each thing that is wrong.
+        warnings: one line per problem.
     """
 
     joint: Joint
@@ -91,11 +91,12 @@ def fit_ball_joint(parent: Sequence[TargetPose], child: Sequence[TargetPose], na
 
     Args:
         parent: n poses of the target before the joint.
-        child: n poses of the target behind it, each with the stamp and the frame of the parent's.
+        child: n poses of the target behind it, with the stamps and frames of the parent's.
         name: of the joint.
 
     Raises:
-        JointFitError: fewer than :data:`MIN_FRAMES` frames, different numbers of poses, or several targets in one.
+        JointFitError: fewer than :data:`MIN_FRAMES` frames, different numbers of poses, or several targets in a
+            sequence.
         PoseTableError: as :func:`body_tracking.markers.pose_table.pose_table`.
     """
     return _fit(JointKind.BALL, parent, child, name)
@@ -130,10 +131,10 @@ def relative_poses(poses: PoseTable) -> tuple[FloatArray, FloatArray]:
 
 
 def fit_joint(name: str, kind: JointKind, poses: PoseTable, parent: str, child: str) -> JointFit:
-    """A joint of some kind between two targets of a table; see :func:`fit_ball_joint`.
+    """A joint of a given kind between two targets of a table; see :func:`fit_ball_joint`.
 
     Raises:
-        JointFitError: fewer than :data:`MIN_FRAMES` frames in which both targets are seen.
+        JointFitError: fewer than :data:`MIN_FRAMES` frames with both targets.
     """
     pair = poses.only((parent, child))
     if len(pair) < MIN_FRAMES:
@@ -156,7 +157,7 @@ def fit_joint(name: str, kind: JointKind, poses: PoseTable, parent: str, child: 
 
 
 def principal_motion(pair: PoseTable, rotations: FloatArray) -> FloatArray:
-    """(3,) :attr:`JointFit.motion` of a pair of targets whose relative rotations are (n, 3, 3)."""
+    """(3,) :attr:`JointFit.motion` of a pair of targets with relative rotations (n, 3, 3)."""
     turns = so3.rotation_vectors(rotations @ so3.mean_rotation(rotations).T)
     squares = np.linalg.eigvalsh(turns.T @ turns / len(turns))[::-1]
     noise = np.trace(pair.covariance[:, :, 3:, 3:], axis1=-2, axis2=-1).sum(axis=1).mean() / 3.0
@@ -209,7 +210,7 @@ def _gap(joint: Joint, rotations: FloatArray, translations: FloatArray) -> float
 
 
 def _turn(joint: Joint, rotations: FloatArray) -> float:
-    """RMS angle between the axes of both targets; of a universal joint what they miss the right angle by."""
+    """RMS angle between the axes of both targets; for a universal joint, its RMS deviation from a right angle."""
     if joint.kind is JointKind.BALL:
         return 0.0
     axes = rotations @ joint.child_axis
@@ -222,7 +223,9 @@ def _turn(joint: Joint, rotations: FloatArray) -> float:
 
 
 def _nearest_on_line(joint: Joint) -> Joint:
-    """A ball joint's centre where the line on which it lies is nearest to both origins (as Gaschler eq. 5.10)."""
+    """Move a ball joint's centre along its undetermined line to the point nearest to both origins (Gaschler eq.
+    5.10).
+    """
     if joint.kind is not JointKind.BALL:
         return joint
     where = [0, 1, 2, 6, 7, 8]

@@ -1,4 +1,4 @@
-"""Balls in an image and points in space, as ``sensor_msgs/PointCloud2``; poses of targets."""
+"""Balls in an image and points in space as ``sensor_msgs/PointCloud2``; poses of targets."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from body_tracking.messages.clouds import (
 )
 
 MAX_POINTS: Final = 10_000
-"""A message with more is malformed."""
+"""A message with more points is rejected."""
 MAX_CAMERAS: Final = 32
 POSE: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
 _BALL: Final[Fields] = tuple((name, FLOAT32) for name in ("u", "v", "area", "uu", "uv", "vv"))
@@ -34,7 +34,7 @@ _INDEX: Final[Fields] = tuple((f"ball{camera}", INT32) for camera in range(MAX_C
 
 
 def balls_to_cloud(balls: ImageBalls, types: MessageTypes) -> Any:
-    """Fields ``u v`` in pixels, ``area``, and ``uu uv vv``, the covariance."""
+    """Cloud with the fields ``u v`` in pixels, ``area``, and the covariance ``uu uv vv``."""
     points = np.empty(len(balls.pixels), dtype=record_of(_BALL))
     points["u"], points["v"] = balls.pixels.T
     points["area"] = balls.areas
@@ -46,8 +46,8 @@ def cloud_to_balls(cloud: Any) -> ImageBalls:
     """The inverse of :func:`balls_to_cloud`.
 
     Raises:
-        MessageError: as :func:`~body_tracking.messages.clouds.read_cloud`; numbers that are not finite, or no
-            covariance.
+        MessageError: as :func:`~body_tracking.messages.clouds.read_cloud`; numbers that are not finite, or a covariance
+            that is not positive definite.
     """
     points = read_cloud(cloud, dict(_BALL), [name for name, _ in _BALL], MAX_POINTS)
     numbers = columns(points, [name for name, _ in _BALL])
@@ -59,7 +59,9 @@ def cloud_to_balls(cloud: Any) -> ImageBalls:
 
 
 def points_to_cloud(points: Points, types: MessageTypes) -> Any:
-    """Fields ``x y z``, the covariance, and ``ball0``, ``ball1``, ...: which ball of each camera it is."""
+    """Cloud with the fields ``x y z``, the covariance, and ``ball0``, ``ball1``, ...: the ball's index in each
+    camera.
+    """
     fields = _POINT + _INDEX[: points.balls.shape[1]]
     rows = np.empty(len(points.positions), dtype=record_of(fields))
     rows["x"], rows["y"], rows["z"] = points.positions.T
@@ -74,7 +76,7 @@ def cloud_to_points(cloud: Any) -> Points:
 
     Raises:
         MessageError: as :func:`~body_tracking.messages.clouds.read_cloud`; a position that is not finite or beyond
-            :data:`~body_tracking.core.skeleton.MAX_RANGE`, a covariance that is none.
+            :data:`~body_tracking.core.skeleton.MAX_RANGE`, a covariance that is not positive definite.
     """
     rows = read_cloud(cloud, dict(_POINT + _INDEX), [name for name, _ in _POINT], MAX_POINTS)
     positions, covariance = columns(rows, ("x", "y", "z")), covariance_of(rows)
@@ -106,12 +108,11 @@ def target_pose_to_message(pose: TargetPose, types: MessageTypes) -> Any:
 
 
 def message_to_target_pose(message: Any, name: str) -> TargetPose:
-    """The inverse of :func:`target_pose_to_message`, without points and residual, which are not in it.
+    """The inverse of :func:`target_pose_to_message`; points and residual are not in the message.
 
     Raises:
-        MessageError: numbers that are not finite, a place beyond
-            :data:`~body_tracking.core.skeleton.MAX_RANGE`, a quaternion far from unit length, a covariance that is
-            not positive definite.
+        MessageError: numbers that are not finite, a position beyond :data:`~body_tracking.core.skeleton.MAX_RANGE`, a
+            quaternion far from unit length, a covariance that is not positive definite.
     """
     place, quat = message.pose.pose.position, message.pose.pose.orientation
     translation = np.array([place.x, place.y, place.z])

@@ -1,10 +1,10 @@
 """Markers in a CSV export of OptiTrack Motive: a column per coordinate, a row per frame.
 
-The first line holds pairs of name and value (``Format Version,1.23,...,Length Units,Meters,...``). Rows of types, names
-and, by the version, identifiers and parents follow, then whether a column is of a rotation or a position, then
-``Frame,Time (Seconds),X,Y,Z,...``. A cell of a marker that is not seen is empty. Of the types of columns, ``Marker`` is
-what the cameras measured; ``Rigid Body Marker`` and ``Bone Marker`` are where the solved body expects a marker, and say
-nothing of the cameras' errors. Format: OptiTrack's documentation, "Data Export: CSV" (versions 1.2 to 1.25).
+The first line holds pairs of name and value (``Format Version,1.23,...,Length Units,Meters,...``). Then follow rows of
+types, names and, depending on the version, identifiers and parents; a row that distinguishes rotations from positions;
+and ``Frame,Time (Seconds),X,Y,Z,...``. The cell of an invisible marker is empty. Columns of type ``Marker`` are
+measured; ``Rigid Body Marker`` and ``Bone Marker`` are positions expected by the solved body, which say nothing of the
+cameras' errors. Format: OptiTrack's documentation, "Data Export: CSV" (versions 1.2 to 1.25).
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ _UNITS: Final = {"meters": 1.0, "centimeters": 1e-2, "millimeters": 1e-3}
 _MEASURED: Final = "Marker"
 _SOLVED: Final = ("Rigid Body Marker", "Bone Marker")
 _HEADER_LINES: Final = 12
-"""The row of axes is one of so many lines."""
+"""The row of axes is within this number of lines."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotiveMarkers:
-    """The markers of an export.
+    """Markers of an export.
 
     Attributes:
         labels: as named in the file.
-        positions: (n, p, 3) metres, in the file's axes, NaN where a marker is not seen.
+        positions: (n, p, 3) metres, in the file's axes, NaN where a marker is invisible.
         stamps_ns: n times in nanoseconds, in the file's clock.
-        warnings: a line for each irregularity.
+        warnings: one line per irregularity.
     """
 
     labels: tuple[str, ...]
@@ -53,14 +53,15 @@ def is_motive_csv(path: Path) -> bool:
 
 
 def read_motive_csv(path: Path, partial: bool = False) -> MotiveMarkers:
-    """The markers of an export.
+    """Read the markers of an export.
 
     Args:
         path: ``.csv``, or ``.csv.gz``.
         partial: read a truncated file up to its last whole row.
 
     Raises:
-        CsvError: the file violates the format, has no markers, or an unknown unit of length; the text names the line.
+        CsvError: the file violates the format, has no markers, or an unknown unit of length; the message names the
+            line.
     """
     file = CsvFile(path)
     header: list[list[str]] = []
@@ -109,7 +110,7 @@ def _columns(file: CsvFile, header: list[list[str]], warnings: list[str]) -> tup
     line = len(header)
     if kinds is None:
         raise file.error(line, f"no column of type {', '.join(kinds_of)}: export markers, too")
-    # versions before 1.2x leave the word Name out
+    # versions before 1.2x omit the word Name
     after = whole[whole.index(kinds) + 1 :]
     names = next((row for row in after if "Name" in row[:2]), after[0] if after else kinds)
     quantities = next((row for row in whole if "Position" in row), None)

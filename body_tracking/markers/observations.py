@@ -1,4 +1,4 @@
-"""What the stages of the marker system pass on: balls in an image, points in space, poses of targets."""
+"""Data passed between the stages of the marker system: balls in an image, points in space, poses of targets."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from body_tracking.core.skeleton import FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageBalls:
-    """The balls that one camera sees at one time.
+    """Balls in one camera's image.
 
     Attributes:
         stamp_ns: capture time, nanoseconds.
         camera: the camera's frame.
-        pixels: (n, 2) centroids, pixels from the centre of the upper left one; of the image as it is, distorted.
+        pixels: (n, 2) centroids in the distorted image; the origin is the centre of the upper left pixel.
         areas: (n,) pixels.
         covariance: (n, 2, 2) of the centroids by the noise of the image, pixels squared.
-        dropped: number of bright regions that are no balls.
+        dropped: number of bright regions that are not balls.
     """
 
     stamp_ns: int
@@ -30,18 +30,18 @@ class ImageBalls:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Points:
-    """Points in space at one time, in no order.
+    """Points in space at one time, unordered.
 
-    What the calibration of the cameras is wrong by is not in the covariance: it is the same for all frames and common
-    to all points. :func:`body_tracking.markers.triangulation.sensitivity` gives it where the rig is known.
+    The covariance excludes the calibration error of the cameras, which is constant over frames and common to all
+    points. :func:`body_tracking.markers.triangulation.sensitivity` gives it for a known rig.
 
     Attributes:
         stamp_ns: capture time, nanoseconds.
         frame_id: of the positions.
         positions: (n, 3) metres.
         covariance: (n, 3, 3) by the noise of the centroids, square metres.
-        balls: (n, c) index of each point among the balls of each camera, -1 where that camera does not see it;
-            (n, 0) for points that come from no images.
+        balls: (n, c) index of each point among the balls of each camera, -1 for a camera that does not see it;
+            (n, 0) for points that do not come from images.
     """
 
     stamp_ns: int
@@ -62,10 +62,10 @@ class TargetPose:
         rotation: (3, 3) and
         translation: (3,) metres: a point x of the target is at ``rotation @ x + translation``.
         covariance: (6, 6) as in ``geometry_msgs/PoseWithCovariance``: x, y, z, and rotations about the fixed axes x, y,
-            z, so that the true rotation is ``exp(rotations) @ rotation``; by the noise of the points and, for
-            measurements of the rig, without its calibration (see :class:`Points`).
-        points: (k,) index among :attr:`Points.positions` of each ball of the target, -1 for one that is not seen.
-        residual: root of the mean squared distance between the seen points and the fitted target, metres.
+            z: the true rotation is ``exp(rotations) @ rotation``. From the noise of the points, without the
+            calibration error of the rig (see :class:`Points`).
+        points: (k,) index of each of the target's balls in :attr:`Points.positions`, -1 if unseen.
+        residual: root mean square distance between the visible points and the fitted target, metres.
     """
 
     name: str

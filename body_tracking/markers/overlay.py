@@ -1,4 +1,4 @@
-"""What is drawn of the marker system: found balls with their targets' names in an image, and the chain in space."""
+"""Overlays of the marker system: detected balls with their targets' names in an image, and the chain in space."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from body_tracking.markers.targets import Target
 
 Colour = tuple[int, int, int]
 NO_TARGET: Final[Colour] = (235, 235, 235)
-"""Of balls that belong to no target."""
+"""Colour of balls that belong to no target."""
 _NEAR_PX: Final = 4.0
-"""From the projection of a target's ball to the ball taken for it; its error is tenths, its radius 3 or more."""
+"""Largest distance in pixels between a target's projected ball and its detection; the error is tenths, a ball's radius
+3 or more."""
 
 
 def targets_of_balls(
@@ -29,13 +30,13 @@ def targets_of_balls(
 
     Args:
         rig: the cameras.
-        camera: index of the one that took the image.
+        camera: index of the image's camera.
         pixels: (n, 2) of the balls.
         targets: by name.
-        poses: of those that are seen, in the rig's frame.
+        poses: of the visible targets, in the rig's frame.
 
     Returns:
-        (n,) index of the pose, -1 for a ball of none.
+        (n,) index of the pose, -1 for a ball of no target.
     """
     found = np.full(len(pixels), -1, dtype=np.intp)
     nearest = np.full(len(pixels), _NEAR_PX)
@@ -55,12 +56,12 @@ def annotate(
 
     Args:
         image: (height, width) uint8 or uint16.
-        balls: that were found in it; None for the bare image.
+        balls: detected in the image; None for the bare image.
         owners: (n,) index of the target of each ball, -1 for none.
         names: of the targets.
         colours: of the targets, RGB.
     """
-    # brightness of 16 bits: sensors fill the upper bits, or 10 to 12 lower ones
+    # 16 bit images: sensors use either the upper bits or the lower 10 to 12
     shift = max(0, int(image.max(initial=0)).bit_length() - 8) if image.dtype == np.uint16 else 0
     drawn: NDArray[np.uint8] = np.repeat((image >> shift).astype(np.uint8)[:, :, None], 3, axis=2)
     if balls is None:
@@ -79,11 +80,11 @@ def annotate(
 
 
 def chain_places(chain: Chain, poses: Sequence[TargetPose]) -> tuple[FloatArray, FloatArray]:
-    """The chain as its targets are seen; a joint neither of whose targets is seen is left out.
+    """Joint centres and segments of the chain from its visible targets; a joint without a visible target is omitted.
 
     Returns:
-        (j, 3) centres of the joints, in the mean of both places where both targets are seen; (n, 2, 3) lines from each
-        target to its joints.
+        (j, 3) centres of the joints, the mean of both estimates where both targets are visible; (n, 2, 3) lines from
+        each target to its joints.
     """
     seen = {pose.name: pose for pose in poses}
     centres, lines = [], []

@@ -1,4 +1,4 @@
-"""Frames of several cameras that were taken at one time."""
+"""Sets of simultaneous frames of several cameras."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from typing import Final, Generic, TypeVar
 
 Frame = TypeVar("Frame")
 _KEPT: Final = 64
-"""Incomplete sets; older ones are given up."""
+"""Largest number of incomplete sets kept; older ones are dropped."""
 _RECENT, _MANY = 30, 10
-"""Sets from which :meth:`FrameSets.problem` judges, and how many of them must lack a camera."""
+"""Number of recent sets that :meth:`FrameSets.problem` examines, and how many of them must lack a camera."""
 
 
 class FrameSets(Generic[Frame]):
-    """Collects the frames of cameras that are triggered together, in sets of equal stamps.
+    """Collects frames of synchronised cameras in sets of equal stamps.
 
     Args:
         cameras: names.
-        tolerance_ns: by which the stamps of a set may differ.
-        max_wait_ns: how long a set waits for its missing frames, by the clock of :meth:`push`.
+        tolerance_ns: largest difference of stamps within a set, nanoseconds.
+        max_wait_ns: longest wait of a set for its missing frames, nanoseconds, by the clock of :meth:`push`.
 
     Attributes:
-        incomplete: number of sets that were given out or left out with a frame missing.
-        late: number of frames that came after their set.
+        incomplete: number of sets returned or dropped with a frame missing.
+        late: number of frames that arrived after their set.
     """
 
     def __init__(self, cameras: Sequence[str], tolerance_ns: int, max_wait_ns: int) -> None:
@@ -36,7 +36,7 @@ class FrameSets(Generic[Frame]):
         self._newest: dict[str, int] = {}
 
     def push(self, camera: str, stamp_ns: int, frame: Frame, now_ns: int) -> list[dict[str, Frame]]:
-        """Take a frame; the sets that are complete with it, in the order of their stamps."""
+        """Add a frame; returns the sets that it completes, in the order of their stamps."""
         self._newest[camera] = stamp_ns
         if self._last_ns is not None and stamp_ns <= self._last_ns + self._tolerance_ns:
             self.late += 1
@@ -49,30 +49,30 @@ class FrameSets(Generic[Frame]):
             self._open.append((stamp_ns, now_ns, {camera: frame}))
             self._open.sort(key=lambda each: each[0])
         complete = [k for k, (_, _, frames) in enumerate(self._open) if len(frames) == len(self._cameras)]
-        # what is older than a complete set will not become complete: cameras send in order
+        # cameras send in order, so sets older than a complete one stay incomplete
         return self._give(complete[-1] + 1 if complete else max(0, len(self._open) - _KEPT))
 
     def poll(self, now_ns: int) -> list[dict[str, Frame]]:
-        """The sets that have waited for long enough."""
+        """Return the sets whose wait has expired."""
         waited = [k for k, (_, arrival, _) in enumerate(self._open) if now_ns - arrival >= self._max_wait_ns]
         return self._give(waited[-1] + 1 if waited else 0)
 
     @property
     def deadline_ns(self) -> int | None:
-        """When the next set has waited for long enough; None where none waits."""
+        """When the wait of the next set expires; None if no set waits."""
         if not self._open:
             return None
         return min(arrival for _, arrival, _ in self._open) + self._max_wait_ns
 
     def problem(self) -> str:
-        """Which camera lacks in many of the latest sets, and how far its stamps are off; empty for none."""
-        # a set of a camera alone says that it is apart, not the others
+        """Name a camera that many of the latest sets lack, and its stamp offset; empty if there is none."""
+        # ignore sets that lack most cameras: there the present camera is the one out of step
         few = [cameras for cameras in self._recent if 2 * len(cameras) <= len(self._cameras)]
         lacking = Counter(camera for cameras in few for camera in cameras)
         often = [camera for camera in self._cameras if lacking[camera] >= _MANY]
         if not often:
             return ""
-        late = often[-1]  # where each lacks the other, the first is the reference
+        late = often[-1]  # where two cameras lack each other, the first is the reference
         count = f"{late} lacks in {lacking[late]} of {len(self._recent)} sets of images"
         other = next((camera for camera in self._cameras if camera != late and camera in self._newest), None)
         if late not in self._newest or other is None:

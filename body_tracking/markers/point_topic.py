@@ -1,4 +1,4 @@
-"""Points that another motion capture system publishes, in place of those of the rig's cameras: stage and codec."""
+"""Stage and codec for points published by another motion capture system, which replace those of the rig's cameras."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from body_tracking.pipeline.shared import RELIABLE as TRANSPORT
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
 
 TYPES: Final = {"PointCloud2": POINT_CLOUD, "MarkerArray": MARKERS}
-"""Types of messages by the names in the parameter ``message``."""
+"""Message types by their names in the parameter ``message``."""
 _SINGLE, _LISTS = (1, 2, 3), (6, 7, 8)
 """``visualization_msgs/Marker``: cube, sphere, cylinder; lists of cubes, of spheres, points."""
 UNSTAMPED: Final = "messages without a stamp"
@@ -33,7 +33,7 @@ MISSING: Final = "points that are not finite"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForeignPoints:
-    """Points of another system: stamp (0 where it states none), frame, (n, 3) metres, (n, 3, 3) covariance if known."""
+    """Points of another system: stamp (0 if unknown), frame, (n, 3) metres, (n, 3, 3) covariance if known."""
 
     stamp_ns: int
     frame_id: str
@@ -42,7 +42,7 @@ class ForeignPoints:
 
 
 class ForeignCodec(Codec):
-    """Reads ``PointCloud2`` with ``x y z`` and maybe ``xx xy xz yy yz zz``, or ``MarkerArray``."""
+    """Reads ``PointCloud2`` with ``x y z`` and optionally ``xx xy xz yy yz zz``, or ``MarkerArray``."""
 
     def __init__(self, type_name: str) -> None:
         self.type_name = type_name
@@ -59,8 +59,8 @@ def from_cloud(cloud: Any) -> ForeignPoints:
     """The points of a ``sensor_msgs/PointCloud2``.
 
     Raises:
-        MessageError: as :func:`~body_tracking.messages.clouds.read_cloud`; some of the fields of a covariance only, or
-            one that is not positive definite.
+        MessageError: as :func:`~body_tracking.messages.clouds.read_cloud`; an incomplete covariance, or one that is not
+            positive definite.
     """
     rows = read_cloud(cloud, dict(POSITION + COVARIANCE), [name for name, _ in POSITION], MAX_POINTS)
     positions, there = columns(rows, "xyz"), [name for name, _ in COVARIANCE if name in (rows.dtype.names or ())]
@@ -77,13 +77,13 @@ def from_cloud(cloud: Any) -> ForeignPoints:
 
 
 def from_markers(message: Any) -> ForeignPoints:
-    """The points of a ``visualization_msgs/MarkerArray``: a sphere (cube, cylinder) each, or a list of them.
+    """The points of a ``visualization_msgs/MarkerArray``: single spheres (cubes, cylinders) or lists of them.
 
-    Texts, lines and arrows are left out, as are the instructions to delete a marker.
+    Texts, lines and arrows are ignored, as are instructions to delete a marker.
 
     Raises:
-        MessageError: more points than a message may have, markers of several times or frames, a list whose own pose is
-            turned.
+        MessageError: more than :data:`MAX_POINTS` points, markers of several times or frames, a list with a rotated
+            pose.
     """
     shown = [each for each in message.markers if each.action == 0 and each.type in _SINGLE + _LISTS]
     headers = {(to_nanoseconds(each.header.stamp), str(each.header.frame_id)) for each in shown}
@@ -105,7 +105,7 @@ def from_markers(message: Any) -> ForeignPoints:
 
 
 class PointTopicStage(Stage):
-    """Takes points that another motion capture system publishes to the topic of the marker system's points."""
+    """Republishes points of another motion capture system on the marker system's topic of points."""
 
     NAME = "marker_points"
     PARAMETERS = (
@@ -155,7 +155,7 @@ class PointTopicStage(Stage):
         yield Output(setup.POINTS, points, stamp_ns)
 
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
-        """A topic on which nothing came yet is named."""
+        """Warn as long as no message has arrived."""
         if not self._frames:
             return 1, f"no message on {self.values['topic']} yet", {}
         return 0, "", {}

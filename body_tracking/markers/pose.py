@@ -1,7 +1,8 @@
-"""The pose of a target from points that are known to be its balls.
+"""The pose of a target from points assigned to its balls.
 
-A closed-form start (Umeyama 1991; Gaschler 2011, section 3.3.3), then the maximum of the likelihood by Gauss-Newton:
-a triangulated point is several times less sure along the line of sight than across, which least squares ignores.
+A closed form (Umeyama 1991; Gaschler 2011, section 3.3.3) initialises the maximum likelihood estimate by Gauss-Newton:
+the standard deviation of a triangulated point is several times larger along the line of sight than across, which
+unweighted least squares ignore.
 """
 
 from __future__ import annotations
@@ -22,19 +23,19 @@ from body_tracking.markers.observations import Points, TargetPose
 from body_tracking.markers.targets import Target
 
 FEWEST: Final = 3
-"""Points that a pose needs, not on one line."""
+"""Least number of points of a pose; they must not be collinear."""
 
 _FLAT: Final = 1e-4
-"""Ratio of the widths of a set of points below which they lie on one line, whatever their noise."""
+"""Ratio of the widths of a set of points, below which they are collinear, whatever their noise."""
 _MAX_ANGLE_STDDEV: Final = 0.5
-"""Radians; a rotation that is less sure is not determined, and its covariance, a linearisation, not true."""
+"""Radians: above it the rotation counts as undetermined, because the linearised covariance is invalid."""
 _ITERATIONS: Final = 10
 _CONVERGED: Final = 1e-7
 """Metres and radians."""
 
 
 class PoseError(BodyTrackingError):
-    """The points do not determine the pose of the target."""
+    """Raised for points that do not determine the pose of the target."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +47,7 @@ class Fits:
         translation: (b, 3) metres: a point x of the target is at ``rotation @ x + translation``.
         covariance: (b, 6, 6) in the order of :class:`~body_tracking.markers.observations.TargetPose`.
         chi_square: (b,) squared Mahalanobis distances of the points from the target, 3m - 6 degrees of freedom.
-        residual: (b,) root of the mean squared distance, metres.
+        residual: (b,) root mean square distance, metres.
     """
 
     rotation: FloatArray
@@ -58,12 +59,12 @@ class Fits:
 
 @lru_cache(maxsize=256)
 def chi_square_gate(degrees: int, missed: float) -> float:
-    """The value that a chi-square variable of so many degrees of freedom exceeds with this probability."""
+    """The value that a chi-square variable with these degrees of freedom exceeds with probability ``missed``."""
     return 2.0 * float(gammainccinv(0.5 * degrees, missed))
 
 
 def umeyama(model: FloatArray, measured: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rotations and translations of least squares, for many sets at once (Umeyama 1991, eq. 39-42).
+    """Least squares rotations and translations of many sets at once (Umeyama 1991, eq. 39-42).
 
     Args:
         model: (b, m, 3) points of targets, metres.
@@ -71,7 +72,7 @@ def umeyama(model: FloatArray, measured: FloatArray, weights: FloatArray) -> tup
         weights: (b, m) not negative.
 
     Returns:
-        (b, 3, 3) and (b, 3), so that ``measured = rotation @ model + translation``.
+        (b, 3, 3) and (b, 3) with ``measured = rotation @ model + translation``.
     """
     rotations, translations = np.empty((len(model), 3, 3)), np.empty((len(model), 3))
     model, measured, weights = map(np.ascontiguousarray, (model, measured, weights))
@@ -96,7 +97,7 @@ def _fitted(
                 for b in range(3):
                     cross[a, b] += share[i] * (measured[n, i, a] - to[a]) * (model[n, i, b] - from_[b])
         left, _, right = np.linalg.svd(cross)
-        # no reflection: the direction that is known worst is turned over
+        # no reflection: flip the least determined direction
         if np.linalg.det(left) * np.linalg.det(right) < 0.0:
             left[:, 2] *= -1.0
         for a in range(3):
@@ -109,15 +110,15 @@ def _fitted(
 def maximum_likelihood(
     model: FloatArray, measured: FloatArray, noise: FloatArray, shape: FloatArray | None = None
 ) -> Fits:
-    """The most likely poses of targets, for many sets of m points at once; the arguments are not checked.
+    """Maximum likelihood poses of targets, for many sets of m points at once; the arguments are not checked.
 
     Gaschler (2011): eq. 6.1-6.3.
 
     Args:
-        model: (b, m, 3) points of targets, metres, not on one line.
+        model: (b, m, 3) points of targets, metres, not collinear.
         measured: (b, m, 3) the same points as measured, metres.
         noise: (b, m, 3, 3) covariance of the measured points.
-        shape: (b, 3m, 3m) covariance of the targets' points; None for targets that are known.
+        shape: (b, 3m, 3m) covariance of the targets' points; None for exactly known targets.
     """
     rotation, translation = umeyama(model, measured, 3.0 / np.trace(noise, axis1=2, axis2=3))
     size = 3 * model.shape[1]
@@ -134,12 +135,12 @@ def _maximised(
     rotations: FloatArray,
     translations: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """The fields of :class:`Fits`, by Gauss-Newton from rotations and translations near to them."""
+    """The fields of :class:`Fits`, by Gauss-Newton from nearby rotations and translations."""
     count, balls = model.shape[:2]
     size = 3 * balls
     rotations, translations = rotations.copy(), translations.copy()
     covariances, chi_squares, residuals = np.empty((count, 6, 6)), np.empty(count), np.empty(count)
-    # derivatives of the points by the pose, and in the last column what is missing to the measured points
+    # columns 0 to 5: derivatives of the points by the pose; column 6: measured minus predicted points
     system = np.zeros((size, 7))
     covariance = np.empty((size, size))
     for n in range(count):
@@ -154,7 +155,7 @@ def _maximised(
                 row[0, 6] = measured[n, i, 0] - x - translations[n, 0]
                 row[1, 6] = measured[n, i, 1] - y - translations[n, 1]
                 row[2, 6] = measured[n, i, 2] - z - translations[n, 2]
-                # the target's own covariance, which turns with it, and the measured point's
+                # covariance of the target's points, rotated, plus that of the measured point
                 for j in range(balls):
                     for a in range(3):
                         for b in range(3):
@@ -176,19 +177,19 @@ def _maximised(
 
 
 def fit_pose(target: Target, points: Points, assignment: IntArray) -> TargetPose:
-    """The most likely pose of a target whose balls are known among the points.
+    """The maximum likelihood pose of a target with known assignment of points to balls.
 
-    The weights are the points' covariances plus that of the target's own points.
+    Weights are by the covariances of the points plus that of the target's own points.
 
     Args:
         target: with k balls.
         points: one frame.
-        assignment: (k,) index of each ball among the points, -1 for one that is not seen.
+        assignment: (k,) index of each ball among the points, -1 if unseen.
 
     Raises:
-        PoseError: fewer than 3 balls, a ball or a point that there is not or that is given twice, numbers that are not
-            finite, a covariance that is not positive definite, or balls so near one line that the rotation about it
-            is not determined.
+        PoseError: fewer than 3 balls, an index out of range or used twice, numbers that are not finite, a covariance
+            that is not positive definite, or balls so nearly collinear that the rotation about their line is
+            undetermined.
     """
     assignment = np.asarray(assignment)
     where = f"target {target.name} at {points.stamp_ns} ns"
@@ -223,12 +224,12 @@ def fit_pose(target: Target, points: Points, assignment: IntArray) -> TargetPose
 
 
 def shape_covariance(target: Target, balls: IntArray) -> FloatArray | None:
-    """(1, 3m, 3m) of these balls of a target; None where the target is known exactly."""
+    """(1, 3m, 3m) covariance of these balls of a target; None for an exactly known target."""
     return balls_covariance(target, balls)[None] if target.covariance.any() else None
 
 
 def balls_covariance(target: Target, balls: IntArray) -> FloatArray:
-    """(3m, 3m) of these balls of a target."""
+    """(3m, 3m) covariance of these balls of a target."""
     rows = (3 * balls[:, None] + np.arange(3)).ravel()
     part: FloatArray = target.covariance[np.ix_(rows, rows)]
     return part

@@ -24,12 +24,12 @@ _PROBLEMS: Final = (
 
 
 class PoseTableError(BodyTrackingError):
-    """Poses that do not belong to one instant and frame, or whose numbers are invalid."""
+    """Raised for poses of different times or frames, or with invalid numbers."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseTable:
-    """Poses of m targets in n frames; what is not seen is the identity with a whitening of zeros.
+    """Poses of m targets in n frames; an unseen pose is the identity with zero whitening.
 
     Attributes:
         targets: m names.
@@ -37,9 +37,9 @@ class PoseTable:
         translations: (n, m, 3) metres.
         covariance: (n, m, 6, 6) as :attr:`TargetPose.covariance`.
         whitening: (n, m, 6, 6) W such that ``W.T @ W`` is the inverse of the covariance.
-        seen: (n, m).
+        seen: (n, m) whether the pose exists.
         residuals: (n, m) metres, :attr:`TargetPose.residual`.
-        balls: (n, m) number of balls of the target that are seen.
+        balls: (n, m) number of visible balls of the target.
     """
 
     targets: tuple[str, ...]
@@ -58,8 +58,8 @@ class PoseTable:
     def rigidity(self) -> FloatArray:
         """(n, m) RMS distance of a target's balls from the target fitted to them, in units of their noise.
 
-        The covariance of the position given the orientation is that of the balls' centroid: a k-th of a ball's. Of the
-        3k coordinates of the balls the pose takes six. NaN where a target is not seen, or by fewer than three balls.
+        Given the orientation, the covariance of the position is that of the balls' centroid, 1/k of a ball's. The pose
+        takes six of the balls' 3k degrees of freedom. NaN for an unseen target, or fewer than three balls.
         """
         place, turn, mixed = self.covariance[..., :3, :3], self.covariance[..., 3:, 3:], self.covariance[..., :3, 3:]
         centroid = place - mixed @ np.linalg.solve(turn, mixed.swapaxes(-1, -2))
@@ -69,13 +69,13 @@ class PoseTable:
         return result
 
     def only(self, targets: Sequence[str]) -> PoseTable:
-        """The frames in which all of these targets are seen, and only these targets."""
+        """The frames in which all these targets are seen, restricted to these targets."""
         columns = [self.targets.index(target) for target in targets]
         rows: BoolArray = np.asarray(self.seen[:, columns].all(axis=1))
         return self._taken(tuple(targets), rows, columns)
 
     def rows(self, rows: BoolArray) -> PoseTable:
-        """Some of the frames: (n,) whether each is among them."""
+        """The frames selected by a mask (n,)."""
         return self._taken(self.targets, rows, list(range(len(self.targets))))
 
     def _taken(self, targets: tuple[str, ...], rows: BoolArray, columns: list[int]) -> PoseTable:
@@ -92,11 +92,11 @@ class PoseTable:
 
 
 def pose_table(frames: Sequence[Sequence[TargetPose]], targets: Sequence[str]) -> PoseTable:
-    """The poses of these targets, frame by frame; poses of other targets are left out.
+    """Table of the poses of these targets, frame by frame; poses of other targets are ignored.
 
     Raises:
         PoseTableError: no frames, a target twice in a frame, poses of one frame with different stamps or frame_ids,
-            numbers that are not finite, a matrix that is no rotation, a covariance that is not positive definite.
+            numbers that are not finite, a matrix that is not a rotation, a covariance that is not positive definite.
     """
     n, m = len(frames), len(targets)
     if n < 1:
@@ -147,8 +147,8 @@ def pose_table(frames: Sequence[Sequence[TargetPose]], targets: Sequence[str]) -
 def _whiten(
     rotations: FloatArray, translations: FloatArray, covariance: FloatArray, seen: BoolArray, whitening: FloatArray
 ) -> int:
-    """Write the whitening of what is seen into zeros; -1, or of the first pose that is invalid three times its number
-    and which of the problems it is.
+    """Write the whitening of the seen poses into zeros; returns -1, or for the first invalid pose three times its index
+    plus the index of the problem.
     """
     n, m = seen.shape
     for at in range(n * m):

@@ -1,7 +1,7 @@
-"""Derivatives of projection by a camera's parameters, its pose and the points; and of rays by the same.
+"""Derivatives of projections by the camera's parameters, its pose and the points; and of rays by the parameters.
 
-The parameters of a camera are those of :class:`body_tracking.markers.rig.Rig`: fx, fy, cx, cy, the coefficients of its
-distortion, a rotation vector w (the true rotation is ``exp(w) @ rotation``) and what is added to its translation.
+The parameters of a camera are those of :class:`body_tracking.markers.rig.Rig`: fx, fy, cx, cy, the distortion
+coefficients, a rotation vector w (the true rotation is ``exp(w) @ rotation``) and an increment of its translation.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from body_tracking.markers.rig import LENS, POSE, Rig
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Projection:
-    """Points seen by a camera.
+    """Projections of points into a camera.
 
     Attributes:
         pixels: (n, 2); NaN for points behind the camera.
@@ -37,13 +37,13 @@ def size(camera: Camera) -> int:
 
 
 def offsets(rig: Rig) -> list[int]:
-    """Index of the first parameter of each camera of a rig, and the number of all."""
+    """Index of the first parameter of each camera of a rig, then the total number."""
     ends = np.cumsum([size(camera) for camera in rig.cameras])
     return [0, *ends.tolist()]
 
 
 def lenses_of(rig: Rig) -> BoolArray:
-    """(p,) which parameters of a rig are those of its cameras' lenses."""
+    """(p,) mask of the lens parameters of a rig."""
     lens = np.ones(rig.size, dtype=np.bool_)
     for end in offsets(rig)[1:]:
         lens[end - POSE : end] = False
@@ -51,7 +51,7 @@ def lenses_of(rig: Rig) -> BoolArray:
 
 
 def parameters(rig: Rig) -> FloatArray:
-    """(p,) the lenses of a rig's cameras; zeros in place of their poses, which are changes."""
+    """(p,) lens parameters of a rig's cameras; zeros for their poses, whose parameters are increments."""
     return np.concatenate(
         [
             np.concatenate([camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]], camera.distortion, np.zeros(POSE)])
@@ -61,14 +61,14 @@ def parameters(rig: Rig) -> FloatArray:
 
 
 def by_lens(camera: Camera, flat: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Pixels of ideal image coordinates, and their derivatives.
+    """Pixels of undistorted image coordinates, and their derivatives.
 
     Args:
         camera: the camera.
         flat: (n, 2) x/z and y/z.
 
     Returns:
-        (n, 2) pixels, (n, 2, 2) their derivative by the coordinates, (n, 2, q - 6) by the parameters of the lens.
+        (n, 2) pixels, (n, 2, 2) their derivative by the coordinates, (n, 2, q - 6) by the lens parameters.
     """
     count = len(flat)
     pixels, by_flat = np.empty((count, 2)), np.empty((count, 2, 2))
@@ -125,7 +125,7 @@ def _by_lens(
 
 
 def project(camera: Camera, rotation: FloatArray, translation: FloatArray, points: FloatArray) -> Projection:
-    """Points (n, 3) of the rig's frame as a camera of the rig sees them, with derivatives."""
+    """Projections of points (n, 3) in the rig's frame into a camera of the rig, with derivatives."""
     count, lens = len(points), LENS + len(camera.distortion)
     turned = points @ rotation.T
     pixels, by_flat = np.empty((count, 2)), np.empty((count, 2, 2))
@@ -152,12 +152,12 @@ def _by_pose(
 
     Args:
         rotation: (3, 3) of the camera.
-        turned: (n, 3) points turned by it,
-        inside: (n, 3) and in the camera's frame.
+        turned: (n, 3) points rotated by it.
+        inside: (n, 3) points in the camera's frame.
         flat: (n, 2) x/z and y/z.
-        by_flat: (n, 2, 2) derivative of the pixels by these.
-        by_parameters: is written.
-        by_point: is written.
+        by_flat: (n, 2, 2) derivative of the pixels by ``flat``.
+        by_parameters: written.
+        by_point: written.
     """
     last = by_parameters.shape[2] - POSE
     for n in range(len(flat)):

@@ -1,7 +1,7 @@
-"""Balls of all cameras as rays in the rig's frame, with what the noise and the calibration leave open of them.
+"""Rays to balls of all cameras in the rig's frame, with their covariance by pixel noise and calibration.
 
-All balls of all cameras stand in one array, so that one numpy call does for them what :class:`Camera` does for one
-camera: with fifteen balls a camera, a call costs more than its numbers.
+All balls of all cameras are in one array, so that one compiled loop does what :class:`Camera` does for one camera: with
+fifteen balls per camera, a call costs more than its arithmetic.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from body_tracking.markers.rig import POSE, Rig
 
 _NEWTON: Final = 20
 _CONVERGED: Final = 1e-10
-"""Image coordinates by which a Newton step, which squares the error, may still move: 1e-7 px."""
+"""Convergence limit in image coordinates, 1e-7 px; each Newton step squares the error."""
 _CELLS: Final = 16
-"""Of a camera's image, either way: within one the calibration's influence on a ray is taken as constant."""
+"""Cells across and down a camera's image, within which the calibration's effect on a ray is taken as constant."""
 
 
 class TriangulationError(BodyTrackingError):
-    """Balls that do not go with a rig: unknown cameras, wrong shapes, numbers that are not finite."""
+    """Raised for balls that do not match the rig: unknown cameras, wrong shapes, numbers that are not finite."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigRays:
-    """What is the same for all images of a rig.
+    """Quantities of a rig that are constant over images.
 
     Attributes:
         index: of each camera, by its frame.
@@ -44,12 +44,12 @@ class RigRays:
         distortion: (8, c) coefficients, zeros where a model has fewer.
         rotations: (c, 3, 3) and
         translations: (c, 3) of the rig.
-        positions: (c, 3) the centres of the cameras in the rig's frame.
-        translation_factor: (c, 3, r) what r independent unknowns of variance 1, that make up the calibration's
-            covariance, add to each translation.
-        flat_factor: (c, cells, cells, 2, r) what they add to the image coordinates x/z, y/z of a far point, against
-            those of its pixel, by cells of the image.
-        cell: (c, 2) pixels.
+        positions: (c, 3) camera centres in the rig's frame, metres.
+        translation_factor: (c, 3, r) effect on each translation of r independent unknowns of variance 1, into which the
+            calibration's covariance is decomposed.
+        flat_factor: (c, cells, cells, 2, r) effect of these unknowns on the image coordinates x/z, y/z of a far point
+            relative to those of its pixel, per cell of the image.
+        cell: (c, 2) size of a cell, pixels.
         epipolar: fundamental matrix and epipoles of the first two cameras (:func:`hartley_sturm.fundamental`).
     """
 
@@ -72,10 +72,10 @@ class Rays:
 
     Attributes:
         cameras: (m,) index of the camera of each ball.
-        balls: (m,) its index among the balls of its camera.
-        flat: (m, 2) x/z and y/z without distortion; NaN where a pixel has no direction.
-        spread: (m, 2, 2) a square root of their covariance by the noise of the centroids.
-        weight: (m, 2, 2) the inverse of their covariance.
+        balls: (m,) index of each ball among the balls of its camera.
+        flat: (m, 2) undistorted x/z and y/z; NaN where a pixel has no direction.
+        spread: (m, 2, 2) a square root of the covariance of ``flat`` by the noise of the centroids.
+        weight: (m, 2, 2) the inverse of that covariance.
         directions: (m, 3) in the rig's frame, with the length of (x/z, y/z, 1).
         flat_factor: (m, 2, r) see :class:`RigRays`.
         first: (c + 1,) index of the first ball of each camera.
@@ -93,7 +93,7 @@ class Rays:
 
 @lru_cache(maxsize=8)
 def rig_rays(rig: Rig) -> RigRays:
-    """What is the same for all images of a rig."""
+    """Quantities of a rig that are constant over images."""
     cameras = rig.cameras
     coefficients = np.zeros((8, len(cameras)))
     for index, camera in enumerate(cameras):
@@ -132,7 +132,7 @@ def rig_rays(rig: Rig) -> RigRays:
 
 
 def _square_root(covariance: FloatArray) -> FloatArray:
-    """(p, r) with ``root @ root.T`` the covariance, without what has no variance."""
+    """(p, r) square root: ``root @ root.T`` is the covariance; directions without variance are dropped."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     safe = np.where(scale > 0.0, scale, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
@@ -142,10 +142,10 @@ def _square_root(covariance: FloatArray) -> FloatArray:
 
 
 def make_rays(geometry: RigRays, images: Sequence[ImageBalls]) -> Rays:
-    """The balls of one time.
+    """Rays to the balls of one time.
 
     Raises:
-        TriangulationError: an unknown camera, one twice, other shapes, numbers that are not finite or no covariance.
+        TriangulationError: a camera unknown or given twice, other shapes, invalid numbers or covariance.
     """
     sorted_images: list[ImageBalls | None] = [None] * len(geometry.index)
     for image in images:
@@ -164,7 +164,7 @@ def make_rays(geometry: RigRays, images: Sequence[ImageBalls]) -> Rays:
     present = [image for image in sorted_images if image is not None]
     counts = [0 if image is None else len(image.pixels) for image in sorted_images]
     first = [0, *np.cumsum(counts).tolist()]
-    # in one order, for a compiled loop exists for each that it is given
+    # contiguous, because numba compiles the loop again for each memory layout
     pixels = np.ascontiguousarray(np.concatenate([np.zeros((0, 2)), *(image.pixels for image in present)]))
     covariance = np.ascontiguousarray(np.concatenate([np.zeros((0, 2, 2)), *(image.covariance for image in present)]))
     cameras = np.repeat(np.arange(len(counts)), counts)
@@ -197,7 +197,7 @@ def _rays(
     directions: FloatArray,
     flat_factor: FloatArray,
 ) -> int:
-    """Write the fields of :class:`Rays`; the index of the first ball whose numbers are invalid, or -1."""
+    """Write the fields of :class:`Rays`; returns the index of the first ball with invalid numbers, or -1."""
     focal, centre, distortion, rotations = optics
     cell, table = cells
     for n in range(len(pixels)):
@@ -212,7 +212,7 @@ def _rays(
             (u - centre[camera, 0]) / fx, (v - centre[camera, 1]) / fy, distortion[:, camera]
         )
         flat[n, 0], flat[n, 1] = x, y
-        # Cholesky's root of the centroid's covariance, brought into image coordinates
+        # Cholesky factor of the centroid's covariance, transformed to image coordinates
         root = math.sqrt(xx)
         a, c = root / fx, xy / root / fy
         d = math.sqrt(yy - (xy / root) ** 2) / fy
@@ -235,9 +235,9 @@ def _rays(
 
 @compiled
 def _undistorted(u: float, v: float, distortion: FloatArray) -> tuple[float, float, float, float, float]:
-    """Ideal image coordinates of distorted ones, NaN where there are none; the derivative of distortion: xx, xy, yy.
+    """Undistorted image coordinates, NaN if there are none, and the derivative of the distortion: xx, xy, yy.
 
-    As :meth:`Camera.undistort`, whose conventions it follows.
+    Conventions as in :meth:`Camera.undistort`.
     """
     k1, k2, p1, p2, k3, k4, k5, k6 = distortion
     x, y = u, v
@@ -258,9 +258,9 @@ def _undistorted(u: float, v: float, distortion: FloatArray) -> tuple[float, flo
         dx, dy = (jyy * du - jxy * dv) / determinant, (jxx * dv - jxy * du) / determinant
         x, y = x + dx, y + dy
         moved = abs(dx) + abs(dy)
-        if not moved > 1e3 * _CONVERGED:  # the next step would be the square of this one
+        if not moved > 1e3 * _CONVERGED:  # convergence is quadratic
             break
-    # determinant and sign: within the range where the polynomials are monotonic
+    # these conditions hold within the range where the polynomials are monotonic
     if not (moved < 1e4 * _CONVERGED and determinant > 0.0 and x * u + y * v >= 0.0):
         x = y = math.nan
     return x, y, jxx, jxy, jyy

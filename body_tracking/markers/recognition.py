@@ -1,7 +1,7 @@
-"""Recognition of targets among unlabelled points, with nothing known from before.
+"""Recognition of targets among unlabelled points, without prior knowledge.
 
-Gaschler 2011, section 3.3, asks for the same: targets among points most of which belong to none, balls that are hidden,
-in real time. His heuristic search is in :mod:`body_tracking.markers.depth_first`; this one is complete.
+The task is that of Gaschler 2011, section 3.3: targets among many points that belong to none, hidden balls, real time.
+His heuristic search is in :mod:`body_tracking.markers.depth_first`; this search is complete.
 """
 
 from __future__ import annotations
@@ -22,27 +22,28 @@ from body_tracking.markers.search import Deadline, DeadlineError, Pairs, Shape, 
 from body_tracking.markers.targets import Target
 
 SURE: Final = 4
-"""Balls that tell a target; three agree too often by chance."""
+"""Balls that identify a target; three match too often by chance."""
 _MISSED_THREE: Final = 0.05
-"""Share of right assignments of three balls of a larger target that are refused: their fit is tested more strictly."""
+"""Share of correct assignments that the stricter chi-square test of three balls of a larger target rejects."""
 _MAX_THREES: Final = 20
-"""Points at an edge of a target, on average, above which three balls are not searched: too many would agree."""
+"""Mean number of points in relation to an edge of a target, above which three balls are not searched: too many
+match."""
 _USELESS: Final = 0.25
-"""A point is ignored whose standard deviation is more than this part of the largest target's size."""
+"""Ratio of a point's standard deviation to the largest target's size, above which the point is ignored."""
 
 
 class RecognitionError(BodyTrackingError):
-    """Targets or points cannot be searched."""
+    """Raised for targets or points that cannot be searched."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recognition:
-    """What was recognised in a frame.
+    """Targets recognised in a frame.
 
     Attributes:
-        poses: of the targets that are certain.
-        ambiguous: targets for which two interpretations remain.
-        complete: whether the search came to its end; if not, targets that are missing may be there.
+        poses: of the certain targets.
+        ambiguous: targets with two remaining interpretations.
+        complete: whether the search finished in time; if not, missing targets may be present.
     """
 
     poses: tuple[TargetPose, ...]
@@ -54,11 +55,11 @@ class Recogniser:
     """Finds targets among points.
 
     Args:
-        targets: with three or more balls each, not on one line; see
-            :func:`body_tracking.markers.distinct.check_distinct` for what they must not be.
+        targets: with three or more balls each, not collinear, distinguishable
+            (:func:`body_tracking.markers.distinct.check_distinct`).
 
     Raises:
-        RecognitionError: no target, a name twice, a target with too few balls or numbers that are not finite.
+        RecognitionError: no target, a duplicate name, a target with too few balls or numbers that are not finite.
     """
 
     def __init__(self, targets: Sequence[Target]) -> None:
@@ -76,11 +77,11 @@ class Recogniser:
 
         Args:
             points: with covariances.
-            deadline: seconds after which to give up; never when None.
-            names: the targets to look for; all when None.
+            deadline: seconds after which the search gives up; None for no limit.
+            names: the targets to search for; None for all.
 
         Raises:
-            RecognitionError: points that are not finite, or without a covariance each.
+            RecognitionError: points that are not finite, or without a valid covariance.
         """
         check_points(points)
         wanted = [name for name in self.targets if names is None or name in names]
@@ -116,7 +117,7 @@ class Recogniser:
         relations = shape.relations(pairs)
         fewest = min(SURE, shape.balls)
         candidates: list[Candidate] = []
-        # an interpretation with two balls less than another costs so much more that it does not matter
+        # two balls fewer cost so much more that such an interpretation cannot compete
         for balls in range(max(shape.balls - 1, fewest), fewest - 1, -1):
             found = shape.assignments(relations, balls, deadline)
             candidates = fitted(target, points, list(found), deadline)
@@ -129,10 +130,11 @@ class Recogniser:
 
 
 def check_targets(targets: Sequence[Target]) -> None:
-    """Refuse what no pose can be had of.
+    """Reject targets whose pose is not determined.
 
     Raises:
-        RecognitionError: no target, a name twice, fewer than three balls, wrong shapes, numbers that are not finite.
+        RecognitionError: no target, a duplicate name, fewer than three balls, wrong shapes, numbers that are not
+            finite.
     """
     names = [target.name for target in targets]
     if not names or len(set(names)) < len(names):
@@ -149,10 +151,10 @@ def check_targets(targets: Sequence[Target]) -> None:
 
 
 def check_points(points: Points) -> None:
-    """Refuse points that cannot be searched.
+    """Reject points that cannot be searched.
 
     Raises:
-        RecognitionError: wrong shapes, numbers that are not finite, a variance that is not positive.
+        RecognitionError: wrong shapes, numbers that are not finite, a covariance that is not positive definite.
     """
     count = len(points.positions)
     if points.positions.shape != (count, 3) or points.covariance.shape != (count, 3, 3):
@@ -168,7 +170,7 @@ def check_points(points: Points) -> None:
 
 @compiled
 def _definite(matrices: FloatArray) -> bool:
-    """Whether all of (n, 3, 3) are positive definite."""
+    """Whether all matrices (n, 3, 3) are positive definite."""
     scratch, definite = np.empty((3, 3)), True
     for n in range(len(matrices)):
         definite &= whitening_of(matrices[n], scratch)
@@ -176,7 +178,7 @@ def _definite(matrices: FloatArray) -> bool:
 
 
 def target_pose(name: str, points: Points, candidate: Candidate) -> TargetPose:
-    """The pose of a way to see a target."""
+    """The pose of a candidate."""
     return TargetPose(
         name,
         points.stamp_ns,

@@ -1,6 +1,6 @@
 """Bright regions of an image: their pixels, the background around them, centroids and shapes (Gaschler 2011, 3.1).
 
-The components come from runs of bright pixels in one pass; all other loops are over the pixels near a component.
+Runs of bright pixels give the components in one pass; all other loops are over the pixels near a component.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ from body_tracking.core.compiled import compiled
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
 
 MARGIN: Final = 3
-"""Pixels around the thresholded region whose light is the ball's."""
+"""Pixels around the thresholded region that still contain the ball's light."""
 _RING: Final = 2
-"""Pixels around the margin, of the background."""
+"""Width of the background ring around the margin, pixels."""
 _LEAST_RING: Final = 12
-"""Pixels from which the background around a ball is known."""
+"""Least number of pixels in the ring for a local estimate of the background."""
 _REACH: Final = 0.8
-"""By which the window of a centroid is larger than the ball, widths of the edge."""
+"""Margin of the centroid's window beyond the ball, in widths of the edge."""
 _LEAST_REACH: Final = 1.2
-"""Pixels."""
+"""Lower bound of that margin, pixels."""
 _SATURATED_REACH: Final = 2.5
-"""Pixels; what is left of the edge of a saturated ball is its long tail."""
+"""That margin for a saturated ball, pixels: only the long tail of its edge remains unsaturated."""
 _LOWER: Final = 0.2
 _UPPER: Final = 0.8
 _EDGE: Final = 1.3
 _LEAST_EDGE: Final = 0.5
-"""Pixels between 10 and 90 % of a ball's brightness."""
+"""Width of a ball's edge from 10 to 90 % of its brightness, pixels: typical and least."""
 _PASSES: Final = 2
 
 
@@ -41,8 +41,8 @@ class Components:
 
     Attributes:
         runs: (r, 4) row, first column, column after the last, and component of each run of bright pixels.
-        areas: (count + 1,) pixels of each.
-        inside: (count + 1,) which do not touch the border of the image.
+        areas: (count + 1,) number of pixels of each component.
+        inside: (count + 1,) whether it does not touch the border of the image.
     """
 
     runs: IntArray
@@ -56,7 +56,7 @@ class Components:
         Gaschler (2011): section 3.1.3.
         """
         bright = image.ravel() > threshold
-        words = np.flatnonzero(bright[: bright.size // 8 * 8].view(np.uint64))  # most have no bright pixel
+        words = np.flatnonzero(bright[: bright.size // 8 * 8].view(np.uint64))  # groups of 8 pixels; most are dark
         return cls(*_components(bright, words, *image.shape))
 
 
@@ -75,7 +75,7 @@ class Regions:
     ceilings: FloatArray
 
     def of(self, members: IntArray) -> tuple[FloatArray, float]:
-        """(4, q) pixels of some regions together, and where they saturate."""
+        """Pixels (4, q) of some regions together, and their lowest saturation level."""
         parts = [self.pixels[:, self.first[member] : self.first[member + 1]] for member in members]
         return np.concatenate(parts, axis=1), float(self.ceilings[members].min())
 
@@ -86,7 +86,7 @@ class Shapes:
 
     Attributes:
         pixels: (n, 2) centroids.
-        areas: (n,) pixels over half of the region's brightness.
+        areas: (n,) soft-thresholded area about the region's half brightness, pixels.
         covariance: (n, 2, 2) of the centroids, by noise.
         elongation: (n,) ratio of the axes.
         fill: (n,) ratio of the area to that of an ellipse with the region's moments.
@@ -107,13 +107,13 @@ def regions_of(
     saturation: float,
     full_well: float,
 ) -> Regions:
-    """The pixels of some components, with the margin around them.
+    """The pixels of the kept components, with the margin around them.
 
     Args:
-        image: (h, w) that they are in.
-        components: all of them: the margin of one does not take the pixels of another.
-        kept: (n,) components that are wanted.
-        background: of the whole image, where that around a region is not known: brightness, and its variance.
+        image: (h, w).
+        components: all components: the margin of one excludes the pixels of another.
+        kept: (n,) indices of the components wanted.
+        background: brightness and variance of the whole image's background, used where no local estimate exists.
         saturation: brightness at which the sensor saturates.
         full_well: electrons of a saturated pixel.
     """
@@ -141,8 +141,8 @@ def shapes_of(regions: Regions, floor: float) -> Shapes:
 
 @compiled
 def histogram(image: NDArray[Any], step: int, levels: int) -> IntArray:
-    """(levels,) numbers of pixels of each brightness in every so many rows of an image (h, w) of whole numbers."""
-    # two tables: neighbours are often equal, and need not wait for each other
+    """(levels,) number of pixels of each brightness in every ``step``-th row of an integer image (h, w)."""
+    # two tables, so that equal neighbours do not update one counter in sequence
     counts = np.zeros((2, levels), dtype=np.int64)
     for y in range(0, image.shape[0], step):
         for x in range(image.shape[1]):
@@ -185,7 +185,7 @@ def _root(parent: IntArray, run: int) -> int:
 
 @compiled
 def _components(bright: BoolArray, words: IntArray, height: int, width: int) -> tuple[IntArray, IntArray, BoolArray]:
-    """Runs (r, 4), areas and which are off the border, of pixels (p,) and the eights of them with a bright one."""
+    """Runs (r, 4), areas and inside masks from pixels (p,) and the indices of groups of eight with a bright one."""
     runs = np.empty((4 * len(words) + 4, 4), dtype=np.int64)
     count, row, stop = 0, -1, 0
     for index in range(len(words) + 1):
@@ -199,7 +199,7 @@ def _components(bright: BoolArray, words: IntArray, height: int, width: int) -> 
                     count += 1
                 stop = x + 1
                 runs[count - 1, 2] = stop
-    # the runs of the row above are from one number to another
+    # above .. first: runs of the row above
     parent, above, first, row = np.empty(count, dtype=np.int64), 0, 0, -1
     for run in range(count):
         y, x, stop = runs[run, 0], runs[run, 1], runs[run, 2]
@@ -234,15 +234,15 @@ def _components(bright: BoolArray, words: IntArray, height: int, width: int) -> 
 def _spread(
     runs: IntArray, first: int, last: int, box: IntArray, owner: NDArray[np.uint16], wide: NDArray[np.uint16]
 ) -> None:
-    """Write the components of a box's pixels with their margin, and with the ring around it; 0 is none.
+    """Write the components of a box's pixels with their margin (owner) and with the ring (wide); 0 is none.
 
     Args:
-        runs: of which those from the first until before the last are in rows near to the box.
+        runs: of the image; those from first until before last are in rows near the box.
         first: index.
         last: index.
         box: (4,) see :func:`_boxes`.
-        owner: zeros of its size.
-        wide: zeros of its size.
+        owner: zeros of the box's size.
+        wide: zeros of the box's size.
     """
     top, bottom, left, right = box
     for run in range(first, last):
@@ -255,7 +255,7 @@ def _spread(
         for y in range(max(row - MARGIN, top), min(row + MARGIN + 1, bottom)):
             for x in range(max(start - MARGIN, left), min(stop + MARGIN, right)):
                 owner[y - top, x - left] = max(owner[y - top, x - left], component)
-    # the margin of one does not take the core of another
+    # the margin of one component excludes the core of another
     for run in range(first, last):
         if top <= runs[run, 0] < bottom:
             for x in range(max(runs[run, 1], left), min(runs[run, 2], right)):
@@ -341,7 +341,7 @@ def _shapes(first: IntArray, pixels: FloatArray, ceilings: FloatArray, floor: fl
         peak = 1e-9
         for n in range(first[k], first[k + 1]):
             peak = max(peak, pixels[2, n])
-        # the linear threshold (equation 3.1) by the region's own brightness; moments about any pixel of the region
+        # linear threshold (equation 3.1) from the region's own brightness; moments about the region's first pixel
         near_x, near_y = pixels[0, first[k]], pixels[1, first[k]]
         area, sx, sy, sxx, sxy, syy, slopes = 1e-9, 0.0, 0.0, 0.0, 0.0, 0.0, 0
         for n in range(first[k], first[k + 1]):
@@ -360,7 +360,7 @@ def _shapes(first: IntArray, pixels: FloatArray, ceilings: FloatArray, floor: fl
         middle, spread = 0.5 * (xx + yy), math.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
         long, short = max(middle + spread, 1e-3), max(middle - spread, 1e-3)
         edge = max(slopes / (2.0 * math.sqrt(math.pi * area)), _LEAST_EDGE)
-        # a window that is symmetrical about the centroid does not move it; half a pixel is its own edge
+        # a window symmetric about the centroid does not bias it; its edge is one pixel wide
         reach = min(max(_REACH * edge, _LEAST_REACH), float(MARGIN))
         if peak >= ceilings[k]:
             reach = _SATURATED_REACH
@@ -382,7 +382,7 @@ def _shapes(first: IntArray, pixels: FloatArray, ceilings: FloatArray, floor: fl
             total = max(total, 1e-9)
             centre_x += sx / total
             centre_y += sy / total
-        # the sharper an edge, the less can pixels tell where it is; saturation sharpens it
+        # the sharper the edge, the worse pixels sample it; saturation sharpens it
         least = (floor * (_EDGE / edge) ** 2) ** 2
         found[k, 0], found[k, 1], found[k, 2] = centre_x, centre_y, area
         found[k, 3] = cxx / total**2 + least
@@ -394,7 +394,7 @@ def _shapes(first: IntArray, pixels: FloatArray, ceilings: FloatArray, floor: fl
 
 @compiled
 def groups_of(pixels: FloatArray, areas: FloatArray, apart: float) -> IntArray:
-    """(n,) the first region of the group of each: of regions whose edges are so near to each other, pixels."""
+    """(n,) index of the first region of each region's group; edges in a group are nearer than ``apart``, pixels."""
     count = len(areas)
     parent = np.arange(count)
     for one in range(count):

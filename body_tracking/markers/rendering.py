@@ -1,8 +1,8 @@
-"""Images of an infrared camera whose light comes back from retro-reflective balls, with their truth.
+"""Rendered images of retro-reflective balls in an infrared camera, with ground truth.
 
-A ball is the set of rays that are within the angle asin(radius / distance) of its centre. Rays are taken on a grid
-finer than the pixels; the rays at its edge count by their distance from it, so that the centroid of what is drawn is
-the outline's within a thousandth of a pixel. All brightness is a share of what saturates the sensor.
+A ball is the set of rays within the angle asin(radius / distance) of its centre. Rays are on a grid finer than the
+pixels; rays at the edge are weighted by their distance from it, so that the rendered centroid matches the outline's
+within a thousandth of a pixel. Brightness is relative to the sensor's saturation.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from body_tracking.markers.spheres import outlines, polygon_centroids
 Image = NDArray[Any]
 
 _PAD: Final = 8
-"""Pixels around the image from which light is blurred into it."""
+"""Pixels of padding around the image, so that blur carries light across its border."""
 _MOST_INSTANTS: Final = 32
 
 
 class RenderingError(BodyTrackingError):
-    """The scene cannot be rendered."""
+    """Raised for a scene that cannot be rendered."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,9 +37,9 @@ class Sensor:
     """A camera's sensor and light.
 
     Attributes:
-        bits: of a pixel; up to 8 give a uint8 image, more, up to 16, a uint16 one.
-        brightness: of a ball 1 m away; it falls with the square of the distance.
-        background: of everything else.
+        bits: per pixel; up to 8 give a uint8 image, 9 to 16 a uint16 one.
+        brightness: of a ball at 1 m; falls with the square of the distance.
+        background: brightness of everything else.
         blur: standard deviation of the Gaussian point spread, pixels.
         read_noise: standard deviation.
         full_well: electrons of a saturated pixel, for the shot noise.
@@ -64,7 +64,7 @@ class Sensor:
             )
 
     def expose(self, light: SingleArray, random: np.random.Generator) -> Image:
-        """What the sensor makes of the light (h, w): noise, saturation, whole numbers."""
+        """Image of the light (h, w) with noise, saturation and rounding."""
         most = 2**self.bits - 1
         counts = random.standard_normal(light.shape, dtype=np.float32)
         counts *= np.sqrt(np.maximum(light, 0.0) / self.full_well + self.read_noise**2)
@@ -77,7 +77,7 @@ class Sensor:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capsule:
-    """A limb that hides: all points within a radius of the segment between two points.
+    """An occluding limb: all points within a radius of a segment.
 
     Attributes:
         start: (3,) and
@@ -92,13 +92,13 @@ class Capsule:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rendered:
-    """An image and its truth.
+    """An image and its ground truth.
 
     Attributes:
         image: (h, w) uint8 or uint16.
-        centres: (n, 2) pixels, projections of the balls' centres in the middle of the exposure.
-        centroids: (n, 2) pixels, centroids of the balls' outlines, if nothing hid them.
-        visible: (n,) share of each ball's outline that is in the image and not hidden.
+        centres: (n, 2) pixels, projections of the balls' centres at mid-exposure.
+        centroids: (n, 2) pixels, centroids of the unoccluded outlines.
+        visible: (n,) share of each ball's outline within the image and not hidden.
     """
 
     image: Image
@@ -109,16 +109,16 @@ class Rendered:
 
 @lru_cache(maxsize=8)
 def _ideal(camera: Camera) -> FloatArray:
-    """(h + 2 _PAD, w + 2 _PAD, 2) ideal coordinates of the pixels and of those around the image.
+    """(h + 2 _PAD, w + 2 _PAD, 2) undistorted coordinates of the pixels of the image and its padding.
 
-    Far to the side where the lens shows nothing.
+    1e3 where the lens maps no direction to the pixel.
     """
     x, y = np.arange(-_PAD, camera.width + _PAD), np.arange(-_PAD, camera.height + _PAD)
     return np.nan_to_num(camera.undistort(np.stack(np.meshgrid(x, y), axis=-1).astype(np.float64)), nan=1e3)
 
 
 def _between(first: int, last: int, size: int, supersampling: int) -> FloatArray:
-    """Linear interpolation (pixels * supersampling, size) from pixels to the rays across those from first to last."""
+    """Linear interpolation (pixels * supersampling, size) from pixels to the rays across pixels first to last."""
     at = np.repeat(np.arange(first, last), supersampling) + np.tile(
         (np.arange(supersampling) + 0.5) / supersampling - 0.5, last - first
     )
@@ -144,7 +144,7 @@ class _Scene:
         self.distance = np.linalg.norm(self.centres, axis=1)
 
     def visible(self, index: int, rays: FloatArray, edge: float) -> FloatArray:
-        """Share (...) of rays (..., 3) that meet a ball and nothing before it; edge: rays per radian."""
+        """Share (...) of rays (..., 3) that hit a ball and nothing in front of it; edge: rays per radian."""
         shown = self._share(index, rays, edge)
         half_angle = self.radius / self.distance
         for other in np.flatnonzero(self.distance < self.distance[index]):
@@ -165,7 +165,7 @@ class _Scene:
     def _hidden(
         start: FloatArray, end: FloatArray, radius: float, rays: FloatArray, edge: float, before: float
     ) -> FloatArray:
-        """Share (...) of rays that come within the radius of a segment nearer than a distance."""
+        """Share (...) of rays that pass within the radius of a segment nearer than ``before``."""
         along = end - start
         length = float(along @ along)
         # closest points of the ray s u and of the segment start + t along
@@ -192,19 +192,19 @@ def render(
     limbs: Sequence[Capsule] = (),
     glints: int = 0,
 ) -> Rendered:
-    """An infrared image of balls.
+    """Render an infrared image of balls.
 
     Args:
-        camera: that sees them.
+        camera: the camera.
         rotation: (3, 3) and
         translation: (3,) metres: a ball x is at ``rotation @ x + translation`` in the camera's frame.
-        balls: (n, 3) centres, metres, in the middle of the exposure.
+        balls: (n, 3) centres, metres, at mid-exposure.
         diameter: of the balls, metres.
         sensor: of the camera.
-        seed: of noise and glints; another one for each camera and image.
-        velocities: (n, 3) metres per second, in the frame of the balls; None for balls that stand still.
-        limbs: what hides balls, in the frame of the balls.
-        glints: number of bright spots at random places, which match no other camera's.
+        seed: of noise and glints; use a different one for each camera and image.
+        velocities: (n, 3) metres per second, in the frame of the balls; None for balls at rest.
+        limbs: occluders, in the frame of the balls.
+        glints: number of bright spots at random places, independent of other cameras.
 
     Raises:
         RenderingError: other shapes, numbers that are not finite, a diameter that is not positive.
@@ -258,7 +258,7 @@ def render(
 def _patch(
     camera: Camera, low: NDArray[np.intp], high: NDArray[np.intp], supersampling: int
 ) -> tuple[FloatArray, float, tuple[slice, slice]] | None:
-    """Rays of a part of the padded image, rays per radian, and the part; None where it is outside."""
+    """Rays of a part of the padded image, rays per radian, and the part; None if it is outside."""
     ideal = _ideal(camera)
     height, width = ideal.shape[:2]
     left, top = np.maximum(low, 1).tolist()
@@ -271,7 +271,7 @@ def _patch(
     x, y = down @ part @ across.T
     rays = np.stack([x, y, np.ones_like(x)], axis=-1)
     rays /= np.sqrt(x * x + y * y + 1.0)[..., None]
-    # pixels per radian: f / cos^2 along the radius, f / cos across it; only the width of an edge depends on it
+    # pixels per radian: f / cos^2 radially, f / cos tangentially; only the width of an edge depends on it
     cosine = float(rays[rays.shape[0] // 2, rays.shape[1] // 2, 2])
     edge = supersampling * float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])) / cosine**1.5
     return rays, edge, (slice(top, bottom), slice(left, right))
@@ -285,7 +285,7 @@ def _binned(values: FloatArray, supersampling: int) -> FloatArray:
 
 
 def _add_glints(light: SingleArray, count: int, random: np.random.Generator) -> None:
-    """Spots of 0.4 to 4 pixels in any direction, up to twice as bright as what saturates."""
+    """Add spots with axes of 0.4 to 4 pixels in random directions, up to twice as bright as saturation."""
     height, width = light.shape
     for _ in range(count):
         x, y = random.uniform(0, width), random.uniform(0, height)
@@ -313,22 +313,22 @@ def render_chessboard(
     black: float = 0.08,
     white: float = 0.7,
 ) -> Image:
-    """An image of a chessboard.
+    """Render a chessboard.
 
     Args:
-        camera: that sees it.
+        camera: the camera.
         rotation: (3, 3) and
         translation: (3,) metres: a point x of the board is at ``rotation @ x + translation`` in the camera's frame.
         columns: and
         rows: of inner corners, as OpenCV counts; corner (i, j) is at (i square, j square, 0).
         square: its side, metres.
         seed: of the noise.
-        sensor: of the camera; its brightness is that of balls and plays no part.
+        sensor: of the camera; its brightness, that of balls, is not used.
         black: brightness of the dark squares.
-        white: of the others, and of an edge of one square around the board.
+        white: brightness of the other squares and of a margin of one square around the board.
 
     Raises:
-        RenderingError: no corners, or squares that have no size.
+        RenderingError: no corners, or squares without a size.
     """
     if columns < 1 or rows < 1 or not square > 0.0:
         raise RenderingError(f"{columns} x {rows} corners and squares of {square} m: expected some of some size")

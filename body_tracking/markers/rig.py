@@ -1,4 +1,4 @@
-"""A rig: calibrated cameras that stand still to each other, and how sure their calibration is."""
+"""A rig: calibrated cameras with fixed relative poses, and the covariance of their calibration."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LENS: Final = 4
 
 
 class RigError(BodyTrackingError):
-    """Cameras and poses do not go together."""
+    """Raised for cameras and poses that do not match."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,16 +30,16 @@ class Rig:
     The rig's frame is that of its first camera, unless a caller chooses another.
 
     Attributes:
-        cameras: two or more, each with a frame of its own.
+        cameras: one or more, each with a frame of its own.
         rotations: (n, 3, 3) and
         translations: (n, 3) metres: a point x of the rig's frame is at ``rotations[i] @ x + translations[i]`` in
             camera i.
-        covariance: (p, p) of :attr:`size` parameters; camera by camera fx, fy, cx, cy, the coefficients of its
-            distortion, and its pose: a rotation vector w, so that the true rotation is ``exp(w) @ rotations[i]``, and
-            what is to be added to the translation. Zeros for what is known.
+        covariance: (p, p) of :attr:`size` parameters; per camera fx, fy, cx, cy, the distortion coefficients, and its
+            pose: a rotation vector w (the true rotation is ``exp(w) @ rotations[i]``) and an increment of the
+            translation. Zeros for exactly known parameters.
 
     Raises:
-        RigError: other shapes, the same frame twice.
+        RigError: no camera, other shapes, a duplicate frame.
     """
 
     cameras: tuple[Camera, ...]
@@ -74,7 +74,7 @@ class Rig:
         )
 
     def changed(self, parameters: Sequence[float] | FloatArray) -> Rig:
-        """The rig whose parameters are larger by these (p,)."""
+        """The rig with increments (p,) added to its parameters."""
         rest = np.asarray(parameters, dtype=np.float64)
         if rest.shape != (self.size,):
             raise RigError(f"{rest.shape} parameters, expected ({self.size},)")
@@ -90,7 +90,7 @@ class Rig:
 
 
 def parallel_cameras() -> Rig:
-    """A rig of two cameras with parallel axes, half a metre apart and known exactly, for trying loops out."""
+    """A rig of two exactly known cameras with parallel axes, half a metre apart, for compiling loops."""
     matrix = np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
     cameras = tuple(Camera(name, 640, 480, matrix, np.zeros(5)) for name in ("left", "right"))
     size = 2 * (LENS + 5 + POSE)

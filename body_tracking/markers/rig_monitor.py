@@ -1,11 +1,11 @@
-"""Watches a calibrated rig: distinguishes a camera that was turned from cameras that are out of step.
+"""Monitors a calibrated rig: distinguishes a camera that was turned from unsynchronised cameras.
 
-Both leave balls beside the epipolar lines of their other images. A turned camera shows a constant pattern over the
-image, also for balls at rest; cameras out of step show distances that are proportional to the velocity in the image.
-The signed epipolar distances of one second are explained by either, or by what the calibration leaves open (with its
-covariance as a prior), in a robust fit that bears balls matched with the wrong partner.
+Both faults move balls off their epipolar lines. A turned camera shows a constant pattern over the image, also for balls
+at rest; unsynchronised cameras show distances proportional to the velocity in the image. A robust fit, which tolerates
+wrong correspondences, explains the signed epipolar distances of one second by either fault or by the calibration error
+alone (with its covariance as a prior).
 
-Two cameras cannot tell which of them turned about the line that joins them: the finding names both then.
+Two cameras cannot tell which of them turned about the line between them: then the finding names both.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from body_tracking.markers.rays import Rays, TriangulationError, make_rays, rig_
 from body_tracking.markers.rig import Rig
 
 _SCALES: Final = (4.0, 2.0, 1.0, 0.5)
-"""Pixels beyond which a distance is an outlier, from the first fit to the last."""
+"""Pixels at which residuals are down-weighted as outliers, from the first fit to the last."""
 _PLACE: Final = 5.0
-"""Pixels after which a ball's distance is another, independent one."""
+"""Pixels of motion after which a ball's epipolar distance counts as independent."""
 _RATE: Final = 60.0
-"""Images per second, about."""
+"""Approximate frame rate, Hz."""
 _FELT: Final = 1e-2
-"""Information of the distances about an unknown of the calibration, in units of its prior, below which it stays."""
+"""Information of the distances about a calibration parameter, in units of its prior, below which it is not fitted."""
 _CUT: Final = 9.0
-"""Squared standard deviations at which the cost of an outlier ends."""
+"""Largest cost of a residual, squared standard deviations."""
 
 
 class Fault(Enum):
-    """What is wrong with a rig."""
+    """Kind of fault of a rig."""
 
     MOVED_CAMERA = "moved camera"
     OUT_OF_STEP = "cameras out of step"
@@ -45,22 +45,22 @@ class Fault(Enum):
 
 @dataclass(frozen=True, slots=True)
 class MonitorSettings:
-    """When a fault is reported.
+    """Thresholds for reporting a fault.
 
     Attributes:
-        window: seconds of images that are looked at.
-        reach: pixels from an epipolar line within which a ball may be the partner when nothing moves.
-        max_delay: longest delay that is looked for, seconds; balls that move are in reach farther away.
-        partners: most balls within reach; a ball with more is left out.
+        window: seconds of images examined.
+        reach: largest distance from an epipolar line of a possible partner at rest, pixels.
+        max_delay: longest delay searched for, seconds; widens the reach for moving balls.
+        partners: largest number of balls within reach; a ball with more is ignored.
         noise: standard deviation of an epipolar distance, pixels.
         jitter: standard deviation of the cameras' capture times, seconds.
-        min_seconds: that the window must hold before anything is reported.
-        min_distances: fewest distances in the window.
-        min_turn: least turn that is reported, radians.
-        min_delay: least delay that is reported, seconds.
-        significance: standard deviations that a turn or delay must exceed.
-        complete: share of the balls that it must bring to a partner's epipolar line.
-        ahead: by which the log likelihood must be better than another cause's.
+        min_seconds: least time span of the window for a report.
+        min_distances: least number of distances in the window.
+        min_turn: smallest turn reported, radians.
+        min_delay: smallest delay reported, seconds.
+        significance: least ratio of a turn or delay to its standard deviation.
+        complete: least share of the balls on a partner's epipolar line after the correction.
+        ahead: least advantage in log likelihood over another cause.
     """
 
     window: float = 0.9
@@ -87,10 +87,9 @@ class Finding:
 
     Attributes:
         fault: its kind.
-        cameras: frames of the camera whose fault it is, or of two between which the images do not decide. Of two
-            cameras out of step it is the one that is late.
-        amount: of the turn in radians, or of the delay in seconds; of three or more cameras one may be early by a
-            negative delay.
+        cameras: frame of the faulty camera, or frames of two between which the images do not decide. Of two
+            unsynchronised cameras, the late one.
+        amount: turn in radians, or delay in seconds; with three or more cameras a negative delay means an early one.
         deviation: its standard deviation.
     """
 
@@ -106,15 +105,15 @@ class Finding:
             else f"{abs(self.amount) * 1e3:.1f} ms"
         )
         text = f"{self.fault.value}: {' or '.join(self.cameras)} by {size}"
-        # two views show only that one turned against the other
+        # two views show only the relative rotation
         return f"{text} (which of them, the images cannot tell)" if len(self.cameras) > 1 else text
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Distances:
-    """Epipolar distances of one time: (n,) pixels, their variance, their share in a place that is new, and derivatives.
+    """Epipolar distances at one time: (n,) pixels, variances, weights by independence, and derivatives.
 
-    A ball with several partners in reach has several; how many balls there are of the camera that sees fewer.
+    A ball has a distance for each partner within reach. ``balls``: number of balls in the camera that sees fewer.
     """
 
     stamp_ns: int
@@ -129,7 +128,7 @@ class _Distances:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Explanation:
-    """A cause fitted to distances: its cost, how many it puts on their lines, the cause (k,), its covariance."""
+    """A cause fitted to distances: cost, number of distances that become inliers, cause (k,), covariance (k, k)."""
 
     cost: float
     on_line: int
@@ -138,17 +137,17 @@ class _Explanation:
 
     @property
     def size(self) -> float:
-        """Of a turn its angle, of a delay its absolute value."""
+        """Angle of a turn, absolute value of a delay."""
         return float(np.linalg.norm(self.cause))
 
     @property
     def significance(self) -> float:
-        """Standard deviations."""
+        """Mahalanobis norm of the cause, in standard deviations."""
         return float(np.sqrt(self.cause @ np.linalg.solve(self.covariance, self.cause)))
 
     @property
     def deviation(self) -> float:
-        """Of the size."""
+        """Standard deviation of the size."""
         direction = self.cause / max(float(np.linalg.norm(self.cause)), 1e-12)
         return float(np.sqrt(direction @ self.covariance @ direction))
 
@@ -157,7 +156,7 @@ class RigMonitor:
     """Collects epipolar distances and diagnoses faults of the rig."""
 
     def __init__(self, rig: Rig, settings: MonitorSettings = _DEFAULT) -> None:
-        """Watch a rig of two cameras or more."""
+        """Monitor a rig of two or more cameras."""
         self._rig, self._settings = rig, settings
         self._geometry = rig_rays(rig)
         self._window: deque[_Distances] = deque()
@@ -169,7 +168,7 @@ class RigMonitor:
         self._last.clear()
 
     def take(self, balls: Sequence[ImageBalls]) -> None:
-        """Take the balls of one time; velocities come from the images before.
+        """Add the balls of one time; velocities come from the previous images.
 
         Raises:
             TriangulationError: as :func:`body_tracking.markers.triangulation.triangulate`.
@@ -204,10 +203,10 @@ class RigMonitor:
         """Add corresponding balls of two cameras.
 
         Args:
-            stamp_ns: capture time; one before the last forgets all images.
+            stamp_ns: capture time, nanoseconds; a time before the last one clears the window.
             cameras: their indices in the rig.
             pixels: (n, 2) in each.
-            velocities: (n, 2) in each, pixels per second; rows with NaN are left out.
+            velocities: (n, 2) in each, pixels per second; rows with NaN are ignored.
         """
         if self._window and stamp_ns < self._window[-1].stamp_ns:
             self._window.clear()
@@ -220,7 +219,7 @@ class RigMonitor:
             self._window.popleft()
 
     def finding(self) -> Finding | None:
-        """What is wrong, or None: nothing, or nothing that is sure yet."""
+        """The fault of the rig; None if there is none or it is not certain yet."""
         search = self.search()
         while True:
             try:
@@ -230,7 +229,7 @@ class RigMonitor:
                 return found
 
     def search(self) -> Generator[None, None, Finding | None]:
-        """:meth:`finding` of the images until now, in steps of some 2 ms that leave time for images between them."""
+        """:meth:`finding` as a generator: yields after steps of about 2 ms, so that images can be processed between."""
         settings, count = self._settings, len(self._rig.cameras)
         distance = np.concatenate([np.zeros(0), *(each.distance for each in self._window)])
         if len(distance) < settings.min_distances:
@@ -255,7 +254,7 @@ class RigMonitor:
             fits.append((turn_fit.cost, Fault.MOVED_CAMERA, frame, turn_fit))
             yield
             delay_fit = _explain(distance, variance, share, by_calibration, by_delay[:, camera : camera + 1], limits[1])
-            if delay_fit.cause[0] > 0.0 or count > 2:  # of two cameras, that one is late is that the other is early
+            if delay_fit.cause[0] > 0.0 or count > 2:  # of two cameras, a negative delay is the other's positive one
                 fits.append((delay_fit.cost, Fault.OUT_OF_STEP, frame, delay_fit))
             yield
         fits.sort(key=lambda fit: fit[0])
@@ -275,14 +274,14 @@ class RigMonitor:
         return sorted(balls, key=lambda image: self._geometry.index[image.camera])
 
     def _pairs_in_reach(self, rays: Rays, velocities: FloatArray, a: int, b: int) -> tuple[IntArray, IntArray]:
-        """Balls of two cameras that are within reach of each other's epipolar lines, and of few others'."""
+        """Balls of two cameras within reach of each other's epipolar lines; balls with many partners are excluded."""
         geometry = self._geometry
         of_a, of_b = slice(rays.first[a], rays.first[a + 1]), slice(rays.first[b], rays.first[b + 1])
         cross = so3.skew(geometry.positions[b] - geometry.positions[a])
         by_b = -rays.directions[of_a] @ cross
         by_a = rays.directions[of_b] @ cross
         volume = by_b @ rays.directions[of_b].T
-        # a pixel's width in image coordinates, without distortion: this is a coarse gate
+        # size of a pixel in image coordinates, ignoring distortion: the gate is coarse
         a_size = np.linalg.norm(by_a @ geometry.rotations[a, :2].T / geometry.focal[a], axis=-1)
         b_size = np.linalg.norm(by_b @ geometry.rotations[b, :2].T / geometry.focal[b], axis=-1)
         speed = np.nan_to_num(np.linalg.norm(velocities, axis=-1))
@@ -323,7 +322,7 @@ class RigMonitor:
             flat = rays.flat[order[side]]
             inside = np.concatenate([flat, np.ones((n, 1))], axis=-1)
             in_camera = by_direction[side] @ rotation.T
-            # a camera turned by w about itself sees a ball elsewhere: its pixel's ray is off by -w x ray, seen as +w
+            # turning the camera by w moves a ball's ray by -w x ray in its frame; the assumed ray is off by +w
             by_turn[:, 3 * camera : 3 * camera + 3] = np.cross(inside, in_camera)
             by_pixel = (in_camera[:, None, :2] @ rays.spread[order[side]])[:, 0]
             square += (by_pixel**2).sum(axis=-1)
@@ -336,7 +335,7 @@ class RigMonitor:
         by_calibration += np.cross(first, second) @ shift
         scale = 1.0 / np.sqrt(square)
         good = np.isfinite(volume * scale)
-        # the same ball at the same place says nothing new: its centroid's bias and a wrong partner stay
+        # a ball at rest adds no information: its centroid's bias and wrong partners stay
         speed = np.minimum(*(np.linalg.norm(each, axis=-1) for each in velocities))
         repeats = 1.0 + _RATE * np.minimum(settings.window, _PLACE / np.maximum(speed, 1e-3))
         return _Distances(
@@ -352,7 +351,7 @@ class RigMonitor:
 
 
 def _velocities(last: ImageBalls, image: ImageBalls) -> FloatArray:
-    """(n, 2) pixels per second of balls whose nearest ball in the image before has none nearer; NaN for others."""
+    """(n, 2) pixels per second, from mutually nearest balls in consecutive images; NaN for others."""
     velocities = np.full((len(image.pixels), 2), np.nan)
     passed = (image.stamp_ns - last.stamp_ns) / NANOSECONDS
     if not len(last.pixels) or not len(image.pixels) or passed <= 0.0:
@@ -366,7 +365,7 @@ def _velocities(last: ImageBalls, image: ImageBalls) -> FloatArray:
 
 
 def _felt(by_calibration: FloatArray, variance: FloatArray) -> FloatArray:
-    """(n, s) the derivative by those few combinations of the calibration's unknowns (n, r) that distances show."""
+    """(n, s) derivative by the combinations of the calibration's unknowns (n, r) that the distances determine."""
     values, vectors = np.linalg.eigh(by_calibration.T @ (by_calibration / variance[:, None]))
     return np.asarray(by_calibration @ vectors[:, values > _FELT])
 
@@ -379,11 +378,11 @@ def _explain(
     by_cause: FloatArray,
     limit: float,
 ) -> _Explanation:
-    """Distances (n,) explained by a cause with derivative (n, k) beside what the calibration leaves open.
+    """Fit distances (n,) by a cause with derivative (n, k) and the calibration's unknowns (n, r).
 
-    The cause has a prior of this deviation about zero: what is larger is out of reach.
+    The cause has a Gaussian prior about zero with the standard deviation ``limit``.
 
-    Iteratively reweighted least squares with the weights of Geman and McClure (1987), its scale from wide to narrow.
+    Iteratively reweighted least squares with the weights of Geman and McClure (1987), scale decreasing.
     """
     r, k = by_calibration.shape[1], by_cause.shape[1]
     derivative = np.concatenate([by_calibration, by_cause], axis=1)
@@ -392,7 +391,7 @@ def _explain(
     for scale in _SCALES:
         for _ in range(3):
             left = distance - derivative @ unknown
-            # of balls that move fast, more is no outlier yet
+            # fast balls have larger variance, so their outlier limit is wider
             width = scale**2 * variance / variance.min() + _CUT * variance
             weight = share / variance / (1.0 + left**2 / width) ** 2
             weighted = derivative * weight[:, None]

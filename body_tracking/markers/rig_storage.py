@@ -15,7 +15,7 @@ from body_tracking.markers import setup
 from body_tracking.markers.rig import LENS, POSE, Rig
 
 MAX_CAMERAS: Final = 16
-"""The covariance has the square of fifteen to eighteen numbers a camera."""
+"""Each camera adds 15 to 18 parameters, and the covariance has their number squared."""
 
 _HEADER: Final = """\
 # Cameras of a marker system, written by body_tracking: a point x of the rig's frame is at R x + t in a camera (axes x
@@ -26,11 +26,11 @@ _HEADER: Final = """\
 
 
 class RigFileError(BodyTrackingError):
-    """A rig's file cannot be read or written."""
+    """Raised for a rig file that cannot be read or written."""
 
 
 def rig_in(folder: object) -> Rig | None:
-    """The rig of a setup; None where it has none, as the points are another motion capture system's.
+    """The rig of a setup; None if it has none, because another motion capture system measures the points.
 
     Raises:
         RigFileError: as :func:`load_rig`.
@@ -40,10 +40,10 @@ def rig_in(folder: object) -> Rig | None:
 
 
 def save_rig(rig: Rig, path: Path) -> None:
-    """Write a rig; the file is replaced as a whole or not at all.
+    """Write a rig; replaces the file atomically.
 
     Raises:
-        RigFileError: more cameras than a file may have, or it cannot be written.
+        RigFileError: more than :data:`MAX_CAMERAS` cameras, or the file cannot be written.
     """
     if len(rig.cameras) > MAX_CAMERAS:
         raise RigFileError(f"{path}: {len(rig.cameras)} cameras, at most {MAX_CAMERAS} in a file")
@@ -72,7 +72,7 @@ def load_rig(path: Path) -> Rig:
     """Read a rig.
 
     Raises:
-        RigFileError: it cannot be read, or holds no rig; the text names what is wrong.
+        RigFileError: the file cannot be read or holds no valid rig; the message names the problem.
     """
     try:
         content = files.read_yaml(path, aliases=False)
@@ -94,7 +94,7 @@ def load_rig(path: Path) -> Rig:
         covariance[np.tril_indices(size)] = lower
         covariance += np.tril(covariance, -1).T
         variances = np.diag(covariance)
-        # of a matrix that is positive semidefinite; correlations, because units differ by orders of magnitude
+        # positive semidefinite; checked on correlations, because units differ by orders of magnitude
         scale = np.where(variances > 0.0, 1.0 / np.sqrt(np.abs(variances) + 1e-300), 1.0)
         if (variances < 0.0).any() or np.linalg.eigvalsh(covariance * np.outer(scale, scale)).min() < -1e-6:
             raise ValueError("covariance is none: a variance is negative")

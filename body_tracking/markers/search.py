@@ -1,9 +1,9 @@
-"""The complete search for the balls of a target among points, over the distances between them.
+"""Complete search for a target's balls among points by pairwise distances.
 
-A distance between two measured points says between which bounds the true one lies. Two balls may be at two points only
-if their distance lies within; a target is found where all its visible balls may pairwise be (a clique; Pintaric and
-Kaufmann 2007, Gaschler 2011, section 3.3). Sets of points are the bits of whole numbers, so that a step of the search
-is a few ands.
+The distance between two measured points bounds the true one. Two balls may be at two points only if their distance lies
+within these bounds; a target matches where all its visible balls are pairwise compatible (a clique; Pintaric and
+Kaufmann 2007, Gaschler 2011, section 3.3). Sets of points are bits of integers, so that a search step is a few bitwise
+ands.
 """
 
 from __future__ import annotations
@@ -22,40 +22,40 @@ from body_tracking.core.skeleton import FloatArray, IntArray
 from body_tracking.markers.targets import Target
 
 GATE: Final = 4.5
-"""Standard deviations of the noise of a distance; 1.7e-4 of the noise of three dimensions lies outside."""
+"""Standard deviations of the noise of a distance; 1.7e-4 of three-dimensional noise lies outside."""
 MAX_PAIRS: Final = 60_000
-"""Pairs of points within the reach of a target; more take longer than any frame has."""
+"""Largest number of pairs of points within the reach of a target; more exceed a frame's time."""
 
 _MOST_GROUPINGS: Final = 60
 
 Relation = dict[int, int]
-"""Points, as bits, at which one ball of an edge may be, by the point of the other one; for one edge of a target."""
+"""For one edge of a target: by the point of one ball, the points compatible with the other ball, as bits."""
 
 
 class DeadlineError(Exception):
-    """The search cannot end in time."""
+    """Raised when the search cannot finish in time."""
 
 
 class Deadline:
-    """A time at which to give up."""
+    """A time limit."""
 
     def __init__(self, seconds: float | None, clock: Callable[[], float] = time.perf_counter) -> None:
         self._clock = clock
         self._end = None if seconds is None else clock() + seconds
 
     def check(self) -> None:
-        """Raises :class:`DeadlineError` once it is past."""
+        """Raise :class:`DeadlineError` if the time is over."""
         if self._end is not None and self._clock() > self._end:
             raise DeadlineError
 
     def remaining(self) -> float | None:
-        """Seconds, not negative; None when it never comes."""
+        """Remaining seconds, at least 0; None without a limit."""
         return None if self._end is None else max(self._end - self._clock(), 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """Pairs of points and the bounds of the distances between the true ones.
+    """Pairs of points and bounds of the true distances between them.
 
     Attributes:
         first: (p,) and
@@ -71,20 +71,20 @@ class Pairs:
 
 
 def near_pairs(positions: FloatArray, covariance: FloatArray, reach: float) -> Pairs:
-    """All pairs of points that may be nearer to each other than a distance.
+    """All pairs of points whose true distance may be below ``reach``.
 
-    The noise e of a difference v of two points lies in the ellipsoid of :data:`GATE` standard deviations. With u the
-    direction of v and s the deviation along it, the true difference v - e is then no shorter than ``|v| - GATE s``,
-    its part along u. It is no longer than the root of ``(|v| + GATE s)^2 + GATE^2 t``, t the variance across u: the
-    second-order term, which is larger than the first for a short edge across the line of sight.
+    The noise e of the difference v of two points lies in the ellipsoid of :data:`GATE` standard deviations. With u the
+    direction of v and s the standard deviation along it, the true difference v - e is at least ``|v| - GATE s`` long,
+    its component along u. It is at most the root of ``(|v| + GATE s)^2 + GATE^2 t`` long, t the variance across u: the
+    second-order term exceeds the first for a short edge across the line of sight.
 
     Args:
         positions: (n, 3) metres.
-        covariance: (n, 3, 3) of them.
+        covariance: (n, 3, 3) of the positions.
         reach: metres.
 
     Raises:
-        DeadlineError: more than :data:`MAX_PAIRS`.
+        DeadlineError: more than :data:`MAX_PAIRS` pairs.
     """
     if len(positions) < 2:
         return Pairs(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0))
@@ -108,13 +108,13 @@ def near_pairs(positions: FloatArray, covariance: FloatArray, reach: float) -> P
 
 
 class Shape:
-    """The distances of a target, as the search needs them.
+    """Distances of a target, prepared for the search.
 
     Attributes:
-        balls: number of them.
+        balls: number of balls.
         distances: (e,) metres, of all pairs of balls in the order of :func:`itertools.combinations`.
-        tolerance: (e,) metres, :data:`GATE` standard deviations of them by the target's own covariance.
-        edge: (k, k) index of the pair of two balls.
+        tolerance: (e,) metres, :data:`GATE` standard deviations of the distances by the target's own covariance.
+        edge: (k, k) index of each pair of balls.
     """
 
     def __init__(self, target: Target) -> None:
@@ -133,7 +133,7 @@ class Shape:
         self.edge: list[list[int]] = edge.tolist()
 
     def relations(self, pairs: Pairs) -> list[Relation]:
-        """For each edge, the points that may be at its ends."""
+        """For each edge, the pairs of points compatible with it."""
         wanted = self.distances[:, None]
         low, high = self.distances + self.tolerance, self.distances - self.tolerance
         fits = (pairs.low <= low[:, None]) & (pairs.high >= high[:, None])
@@ -154,21 +154,21 @@ class Shape:
         deadline: Deadline,
         allowed: Sequence[int] | None = None,
     ) -> Iterator[tuple[int, ...]]:
-        """All assignments of points to at least so many balls in which every two balls may be where they are.
+        """All assignments of points to at least ``fewest`` balls with pairwise compatible distances.
 
-        Of an assignment, its parts of fewer balls are given, too. Some are given twice.
+        Includes the parts of an assignment with fewer balls. Some assignments occur twice.
 
         Args:
             relations: of the edges.
             fewest: 2 or more.
-            deadline: checked all the time.
-            allowed: for each ball, the points at which it may be, as bits; all when None.
+            deadline: checked in every step.
+            allowed: for each ball its allowed points, as bits; None for all.
 
         Yields:
-            For each ball its point, -1 for one that is not seen.
+            For each ball its point, -1 if unseen.
 
         Raises:
-            DeadlineError: it is past.
+            DeadlineError: the time is over.
         """
         edge = self.edge
         chosen = [-1] * self.balls
@@ -219,9 +219,9 @@ class Shape:
                 deadline.check()
 
     def _bases(self, fewest: int, counts: IntArray) -> list[tuple[int, int]]:
-        """Edges of which any so many balls contain one, those with the fewest candidates.
+        """Edges such that any ``fewest`` balls contain one of them, chosen for the fewest candidates.
 
-        Balls in ``fewest - 1`` groups: two of ``fewest`` balls are in the same group.
+        With the balls in ``fewest - 1`` groups, two of ``fewest`` balls are in one group (pigeonhole principle).
         """
         best: list[tuple[int, int]] = []
         least = np.inf
@@ -233,7 +233,7 @@ class Shape:
 
 
 def bits(number: int) -> Iterator[int]:
-    """The places of the ones of a number."""
+    """Indices of the set bits of a number."""
     while number:
         lowest = number & -number
         yield lowest.bit_length() - 1
@@ -242,7 +242,7 @@ def bits(number: int) -> Iterator[int]:
 
 @lru_cache(maxsize=64)
 def _groupings(balls: int, groups: int) -> list[list[tuple[int, int]]]:
-    """The edges within the groups, for ways to make so many groups of as equal size as can be; not all if many."""
+    """Edges within the groups, for the partitions into groups of nearly equal sizes; at most ``_MOST_GROUPINGS``."""
     sizes = [balls // groups + (number < balls % groups) for number in range(groups)]
     results: list[list[tuple[int, int]]] = []
 

@@ -1,4 +1,4 @@
-"""A folder with what the marker nodes need: ``rig.yaml``, ``targets.yaml``, ``chain.yaml``; and names of topics."""
+"""Folder with the marker nodes' files ``rig.yaml``, ``targets.yaml`` and ``chain.yaml``; names of topics."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _FRAME_SUFFIX: Final = "_optical_frame"
 
 
 class SetupError(BodyTrackingError):
-    """The folder lacks a file, or none is given."""
+    """Raised when no folder is given or it lacks a file."""
 
 
 def file_of(folder: object, name: str, made_by: str) -> Path:
@@ -26,7 +26,7 @@ def file_of(folder: object, name: str, made_by: str) -> Path:
     Args:
         folder: the parameter ``setup``.
         name: one of the three.
-        made_by: the command that makes it, for the error.
+        made_by: the command that writes it, for the error message.
 
     Raises:
         SetupError: no folder, or no such file in it.
@@ -40,7 +40,7 @@ def file_of(folder: object, name: str, made_by: str) -> Path:
 
 
 def camera_names(folder: Path) -> tuple[str, ...]:
-    """The names of the cameras of a setup's rig, without reading all of it.
+    """The names of the cameras of a setup's rig, without parsing the rest of it.
 
     Raises:
         SetupError: no folder, or no such file in it, or it names no cameras.
@@ -80,14 +80,14 @@ def pose_topic(target: str) -> str:
 
 
 def sources(cameras: Sequence[str]) -> tuple[tuple[str, ...], ...]:
-    """The topics from which everything else follows: of images, or of balls, or of points."""
+    """Alternative sets of topics that the other data can be computed from: images, balls, or points."""
     return tuple(map(image_topic, cameras)), tuple(map(balls_topic, cameras)), (POINTS,)
 
 
 def sources_in(folder: Path) -> tuple[tuple[str, ...], ...]:
     """:func:`sources` of a setup.
 
-    Without a rig, only those of points, which another motion capture system measured then.
+    Without a rig, only points, which then come from another motion capture system.
 
     Raises:
         SetupError: as :func:`camera_names`.

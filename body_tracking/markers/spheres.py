@@ -1,4 +1,4 @@
-"""The image of a sphere: the cone of rays that touch it, cut by the image plane, seen through the lens."""
+"""The image of a sphere: the cone of tangent rays, cut by the image plane, distorted by the lens."""
 
 from __future__ import annotations
 
@@ -11,32 +11,32 @@ from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import FloatArray
 
 _VERTICES: Final = 64
-"""Of the polygon that stands for an outline; of a ball of 14 mm its centroid is within 1e-4 pixels of the outline's."""
+"""Of the outline's polygon; the centroid error for a ball of 14 mm is below 1e-4 pixels."""
 _ITERATIONS: Final = 3
 
 
 class SphereError(BodyTrackingError):
-    """No sphere in front of a camera has these parameters."""
+    """Raised for parameters that describe no sphere in front of a camera."""
 
 
 def outlines(camera: Camera, centres: FloatArray, radius: float, vertices: int = _VERTICES) -> FloatArray:
     """Pixels of the outlines of spheres.
 
     Args:
-        camera: its lens distorts the outlines.
+        camera: with its distortion.
         centres: (n, 3) metres, in the camera's frame.
         radius: of the spheres, metres.
         vertices: of each polygon.
 
     Returns:
-        (n, vertices, 2) pixels; NaN where a ray goes backwards, or the camera's centre is in the sphere.
+        (n, vertices, 2) pixels; NaN if a ray points backwards, or the camera's centre is inside the sphere.
     """
     distance = np.linalg.norm(centres, axis=1, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
         axis = centres / distance
         sine = radius / distance
         cosine = np.sqrt(1.0 - sine**2)
-    # two directions at right angles to the axis, the first towards the optical axis or away from it
+    # two directions perpendicular to the axis, the second in the plane of the axis and the optical axis
     across = np.cross(axis, [0.0, 0.0, 1.0])
     length = np.linalg.norm(across, axis=1, keepdims=True)
     across = np.where(length > 1e-9, across / np.maximum(length, 1e-9), [1.0, 0.0, 0.0])
@@ -59,22 +59,22 @@ def polygon_centroids(polygons: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def sphere_centre_correction(camera: Camera, pixels: FloatArray, depths: FloatArray, radius: float) -> FloatArray:
-    """How far the projection of a sphere's centre is from the centroid of its image.
+    """Offset of the projection of a sphere's centre from the centroid of its image.
 
-    The rays that touch the sphere form a cone around the ray of its centre. Without distortion the cone cuts the image
-    plane in an ellipse whose centre is the projection of the sphere's, taken away from the principal point by the
-    factor 1 / (1 - r^2 / z^2): at the depth z, (tan(a + b) + tan(a - b)) / 2 for a centre at the angle a from the
-    optical axis and sin b = r / distance. A lens that distorts moves the centroid of the outline once more; therefore
-    the centroids of the outlines themselves are taken, and the fixed point is found of centre = pixel - its shift.
+    The tangent rays form a cone around the ray of the centre. Without distortion the cone cuts the image plane in an
+    ellipse whose centre is the projection of the sphere's centre moved away from the principal point by the factor
+    1 / (1 - r^2 / z^2), z the depth: (tan(a + b) + tan(a - b)) / 2 for a centre at the angle a from the optical axis
+    and sin b = r / distance. Lens distortion moves the centroid once more; therefore the outlines' centroids are
+    computed, and the equation centre = pixel - shift(centre) is solved by fixed-point iteration.
 
     Args:
-        camera: that sees the spheres.
-        pixels: (n, 2) centroids of their images.
-        depths: (n,) metres, z of the centres in the camera's frame; 1 % of it is 2 % of the correction.
+        camera: the camera.
+        pixels: (n, 2) centroids of the spheres' images.
+        depths: (n,) metres, z of the centres in the camera's frame; an error of 1 % changes the correction by 2 %.
         radius: of the spheres, metres.
 
     Returns:
-        (n, 2) pixels to be added to the centroids; NaN for a pixel that is.
+        (n, 2) pixels to be added to the centroids; NaN for NaN pixels.
 
     Raises:
         SphereError: other shapes, a radius that is not positive, or depths that are not greater than it.

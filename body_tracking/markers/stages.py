@@ -1,4 +1,4 @@
-"""From images to joint angles: the stages of the marker nodes (Gaschler 2011, figure 2.1)."""
+"""Stages of the marker nodes, from images to joint angles (Gaschler 2011, figure 2.1)."""
 
 from __future__ import annotations
 
@@ -35,30 +35,31 @@ from body_tracking.pipeline.shared import names_in
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
 
 _SATURATED: Final = 0.05
-"""Share of an image's pixels beyond which it is called saturated: 15 balls, 1 m away, fill less than 1 % of 640x480."""
+"""Share of saturated pixels above which the image is reported: 15 balls at 1 m fill less than 1 % of 640x480."""
 _ROWS: Final = 4
-"""Every so many rows are looked at for it."""
+"""The check uses every fourth row."""
 _WATCH_NS: Final = NANOSECONDS // 4
-"""Between two searches for a moved camera, of some frames each; a fault is to be named within a second."""
+"""Nanoseconds between two searches for a moved camera; a search takes some frames, and a fault must be named within a
+second."""
 _SEARCH_NS: Final = NANOSECONDS // 10
-"""After which a search is brought to its end at the next images, few as they come."""
+"""Nanoseconds after which a search is finished with the next images, at low frame rates."""
 _LONGEST_NS: Final = NANOSECONDS // 5
-"""Between two frames whose difference is a rate."""
+"""Longest time between two frames for a rate by their difference, nanoseconds."""
 CONVENTION: Final = "markers"
-"""What the frame of the angles' headers says."""
+"""frame_id of the angles' headers."""
 SETUP = Parameter("setup", "", "folder with rig.yaml, targets.yaml and chain.yaml (body_tracking markers)")
 CAMERAS = Parameter(
     "cameras", (), "names of the cameras, whose /<camera>/image_raw the node takes; empty for those of the setup's rig"
 )
 _IMAGES: Final = Qos(reliability="reliable", depth=10)
 _KEPT: Final = 64
-"""Images of a camera that wait with the parameter ``reliable``: two seconds, 20 MB at 640x480."""
+"""Queued images per camera with the parameter ``reliable``: two seconds, 20 MB at 640x480."""
 _DETECTION: Final = ("lower", "noise", "least_area", "most_area", "most_balls")
 _TRIANGULATION: Final = ("gate", "nearest", "farthest")
 
 
 def with_rates(found: ChainAngles, last: JointAngles | None) -> JointAngles:
-    """The angles with their rates since the last ones, by the noise of both; unknown at the first."""
+    """Add rates from the difference to the last angles, with deviations by the noise of both; unknown at the start."""
     rates, deviations = np.full_like(found.angles, np.nan), np.full_like(found.angles, np.inf)
     if last is not None and 0 < found.stamp_ns - last.stamp_ns < _LONGEST_NS:
         elapsed = (found.stamp_ns - last.stamp_ns) / NANOSECONDS
@@ -68,7 +69,7 @@ def with_rates(found: ChainAngles, last: JointAngles | None) -> JointAngles:
 
 
 class DetectorStage(Stage):
-    """Finds the balls in the images of cameras, the first stage of figure 2.1 of Gaschler (2011)."""
+    """Detects balls in the images of cameras, the first stage of figure 2.1 of Gaschler (2011)."""
 
     NAME = "marker_detector"
     PARAMETERS = (SETUP, CAMERAS, *parameters_from(DetectionSettings, only=_DETECTION, live=True), TRANSPORT)
@@ -90,7 +91,7 @@ class DetectorStage(Stage):
         self.outputs = tuple(Port(topic, Balls(), RELIABLE, measured=True) for topic in self._topics.values())
 
     def change(self, values: Mapping[str, Value]) -> None:
-        """From the next image on."""
+        """Takes effect with the next image."""
         self._settings = DetectionSettings(**fields_of(DetectionSettings, values))
         self.values = values
 
@@ -103,7 +104,7 @@ class DetectorStage(Stage):
         yield Output(self._topics[topic], balls, stamp_ns)
 
     def _check(self, topic: str, pixels: NDArray[Any]) -> None:
-        """Note a saturated image; raise ImageError for one of another size than the calibrated one."""
+        """Note a saturated image; raise ImageError for an image whose size differs from the calibrated one."""
         self._problems.pop(topic, None)
         camera = self._sizes.get(topic)
         if camera is not None and pixels.shape != (camera.height, camera.width):
@@ -119,7 +120,7 @@ class DetectorStage(Stage):
             self._counters["saturated images"] += 1
 
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
-        """A camera whose last image was of another size or saturated is named."""
+        """Warn of cameras whose last image had another size or was saturated."""
         return (1, "; ".join(self._problems.values()), {}) if self._problems else (0, "", {})
 
     @property
@@ -128,7 +129,7 @@ class DetectorStage(Stage):
 
 
 class TriangulationStage(Stage):
-    """Finds the points in space from the balls in the images of a rig."""
+    """Triangulates points in space from the balls in the images of a rig."""
 
     NAME = "marker_triangulation"
     PARAMETERS = (
@@ -189,13 +190,13 @@ class TriangulationStage(Stage):
             yield Output(graph.TF_STATIC, (now.ros_ns, first, frames))
 
     def change(self, values: Mapping[str, Value]) -> None:
-        """From the next images on."""
+        """Takes effect with the next images."""
         self._settings = TriangulationSettings(**fields_of(TriangulationSettings, values))
         self.values = values
 
     def take(self, topic: str, payload: ImageBalls, now: Now) -> Iterable[Output]:
         frame = self._frames[topic]
-        if payload.camera != frame:  # the topic says which camera it is
+        if payload.camera != frame:  # the topic determines the camera
             self._counters["balls in another frame"] += 1
             payload = replace(payload, camera=frame)
         return self._points(self._sets.push(frame, payload.stamp_ns, payload, now.steady_ns))
@@ -213,7 +214,7 @@ class TriangulationStage(Stage):
         self._watched_ns = self._finding = self._search = None
 
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
-        """A camera that was moved, or one out of step with the others, by its images or by its stamps, is named."""
+        """Warn of a moved camera, or of one that is unsynchronised by its images or by its stamps."""
         problems = [text for text in (self._sets.problem(), str(self._finding or "")) if text]
         return (1, "; ".join(problems), {}) if problems else (0, "", {})
 
@@ -224,11 +225,11 @@ class TriangulationStage(Stage):
             if self._diameter and len(points.positions):
                 points = triangulate(self.rig, centred(self.rig, balls, points, self._diameter), self._settings)
             yield Output(setup.POINTS, points, points.stamp_ns)
-            # nothing waits for it: after the points are on their way
+            # after publishing, because the check may take time
             self._watch(balls)
 
     def _watch(self, balls: tuple[ImageBalls, ...]) -> None:
-        """Look for a moved camera and for cameras out of step; a new fault is told in the log at once."""
+        """Search for a moved camera and for unsynchronised cameras; log a new fault at once."""
         self._monitor.take(balls)
         stamp_ns = balls[0].stamp_ns
         if self._watched_ns is None or stamp_ns < self._watched_ns:

@@ -23,7 +23,7 @@ from body_tracking.pipeline.system import (
 )
 
 FOREIGN_TYPES = ("PointCloud2", "MarkerArray")
-"""Types of another system's points."""
+"""Message types of another system's points."""
 _STAGES = "body_tracking.markers.stages"
 
 

@@ -1,7 +1,7 @@
-"""The geometry of a target from many views of it (Gaschler 2011, section 4.2), or from a drawing.
+"""Geometry of a target from many views (Gaschler 2011, section 4.2) or from a drawing.
 
-The frame of a target has its origin at the centroid of its balls. From views, x points from ball 0 to ball 1, and y
-from that line towards the first further ball that is not near it; from a drawing, the axes are the drawing's.
+The origin of a target's frame is the centroid of its balls. From views, x points from ball 0 to ball 1, and y from that
+line towards the first further ball that is not near it; from a drawing, the axes are the drawing's.
 """
 
 from __future__ import annotations
@@ -21,34 +21,35 @@ from body_tracking.markers.recognition import Recogniser
 from body_tracking.markers.targets import Target
 
 _MISSED: Final = 1e-4
-"""Share of right views that are dropped as outliers."""
+"""Share of correct views rejected as outliers."""
 _ITERATIONS: Final = 30
 _CONVERGED: Final = 1e-8
 """Metres."""
 _RIGID: Final = 0.1
-"""Noise of a coordinate, as a part of a target's size, above which its balls do not keep their places."""
+"""Noise of a coordinate as a share of the target's size, above which the views contradict each other."""
 _BENT: Final = 3.0
-"""How much more than its median a flexible target may bend in a view; a person's skin does so in each step."""
+"""Factor on the standard deviation of a flexible target's view, up to which it is no outlier; skin moves in each
+step."""
 _PROCRUSTES: Final = 10
-"""Iterations of the start."""
+"""Iterations of the initial Procrustes analysis."""
 _ON_LINE: Final = 0.1
-"""A ball is near a line when its distance from it is less than this part of the target's size."""
+"""A ball is near a line if its distance from it is less than this share of the target's size."""
 
 
 class TargetCalibrationError(BodyTrackingError):
-    """The views do not determine the target."""
+    """Raised for views that do not determine the target."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetCalibration:
-    """A target as calibrated.
+    """A calibrated target.
 
     Attributes:
         target: with the covariance of its points; the frame's six degrees of freedom have none.
         used: (f,) which views were used; the others have too few balls or are outliers.
-        noise: standard deviation of a coordinate, metres: that of the residuals.
-        reduced_chi_square: of the residuals by the covariances that were given, 1 when these are true, or
-            when none were.
+        noise: standard deviation of a coordinate from the residuals, metres.
+        reduced_chi_square: of the residuals by the given covariances, about 1 if these are correct; 1 without given
+            covariances.
     """
 
     target: Target
@@ -64,24 +65,24 @@ def calibrate_target(
     diameter: float = 0.0,
     flexible: bool = False,
 ) -> TargetCalibration:
-    """The most likely points of a target, over its points and its poses in all views.
+    """Maximum likelihood points of a target, over its points and its poses in all views.
 
     Gaschler (2011): eq. 4.13, 4.18-4.19.
 
-    A generalised Procrustes analysis gives the start, Gauss-Newton the maximum; in each step the poses are eliminated
-    (Schur complement), so that the time grows with the number of views only. Views that do not fit are dropped.
+    A generalised Procrustes analysis initialises Gauss-Newton; each step eliminates the poses (Schur complement), so
+    that time grows linearly with the number of views. Views that do not fit are rejected.
 
     Args:
         name: of the target.
-        views: (f, k, 3) metres, balls in the same order in all views, NaN for a ball that is not seen.
-        covariance: (f, k, 3, 3) of them; when None, all coordinates have the same noise, which is estimated.
+        views: (f, k, 3) metres, balls in the same order in all views, NaN for an unseen ball.
+        covariance: (f, k, 3, 3) of the views; None for equal noise of all coordinates, which is then estimated.
         diameter: of the balls, metres.
-        flexible: add to the target's covariance how much each ball moves within the target, which is what its
-            residuals have more than the noise; without covariances, all that is more than the stiffest ball has.
+        flexible: add each ball's motion within the target to the target's covariance: the variance of its residuals
+            beyond the noise; without covariances, beyond that of the stiffest ball.
 
     Raises:
-        TargetCalibrationError: wrong shapes, fewer than 3 balls or than 2 views with 3 of them, balls that are hardly
-            seen, balls on one line, or views most of which contradict each other.
+        TargetCalibrationError: wrong shapes, fewer than 3 balls or than 2 views with 3 of them, rarely seen balls,
+            collinear balls, or views most of which contradict each other.
     """
     views, seen, weights = _checked(name, views, covariance)
     count, balls = seen.shape
@@ -92,7 +93,7 @@ def calibrate_target(
     costs, used = np.full(count, np.inf), np.zeros(count, dtype=bool)
     for _ in range(_ITERATIONS):
         costs[enough] = _costs(shape, views[enough], seen[enough], weights[enough])
-        # a target that is not quite rigid, or noise that is larger than stated, makes no outliers
+        # scaled by the median cost, so that a slightly flexible target or underestimated noise makes no outliers
         unit: float = _robust_unit(costs[enough], degrees[enough])
         unit = unit if covariance is None else max(unit, 1.0)
         fits = enough & (costs <= (_BENT**2 if flexible else 1.0) * unit * gates)
@@ -129,16 +130,16 @@ def calibrate_target(
 
 
 def known_target(name: str, points: FloatArray, stddev: float = 0.0, diameter: float = 0.0) -> Target:
-    """A target whose geometry is known, as from a drawing; its origin moves to the centroid of the balls.
+    """A target of known geometry, as from a drawing; its origin moves to the centroid of the balls.
 
     Args:
         name: of the target.
-        points: (k, 3) centres of the balls, metres; three or more, not on one line.
-        stddev: of each coordinate as built, metres.
+        points: (k, 3) centres of the balls, metres; three or more, not collinear.
+        stddev: manufacturing standard deviation of each coordinate, metres.
         diameter: of the balls, metres.
 
     Raises:
-        TargetCalibrationError: wrong shapes, numbers that are not finite, balls on one line.
+        TargetCalibrationError: wrong shapes, numbers that are not finite, collinear balls.
     """
     points = np.array(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < FEWEST or not np.isfinite(points).all():
@@ -150,21 +151,20 @@ def known_target(name: str, points: FloatArray, stddev: float = 0.0, diameter: f
 
 
 def ordered_views(frames: Sequence[Points], balls: IntArray, first: int = 0) -> tuple[FloatArray, FloatArray]:
-    """Views of one target from unlabelled points: those of the first frame are searched for in all others.
+    """Views of one target from unlabelled points: the balls chosen in one frame are recognised in all others.
 
-    Gaschler 2011, section 4.2.1: a frame in which they are not found is left out.
+    Gaschler 2011, section 4.2.1: frames without the target are left out.
 
     Args:
-        frames: with the target, whose other points may be anything.
-        balls: (k,) index of the target's balls among the points of the first frame.
-        first: index of the first frame.
+        frames: with the target and arbitrary other points.
+        balls: (k,) index of the target's balls among the points of that frame.
+        first: index of that frame.
 
     Returns:
-        views (f, k, 3) and covariances (f, k, 3, 3) as :func:`calibrate_target` takes them; NaN and zero for balls that
-        are not seen.
+        views (f, k, 3) and covariances (f, k, 3, 3) for :func:`calibrate_target`; NaN and zero for unseen balls.
 
     Raises:
-        TargetCalibrationError: fewer than 3 balls, or a point that there is not.
+        TargetCalibrationError: fewer than 3 balls, or an index out of range.
     """
     start, chosen = frames[first], np.asarray(balls)
     if len(set(chosen.tolist())) < FEWEST or chosen.min() < 0 or chosen.max() >= len(start.positions):
@@ -197,7 +197,7 @@ class _Fit:
 
 
 def _checked(name: str, views: FloatArray, covariance: FloatArray | None) -> tuple[FloatArray, BoolArray, FloatArray]:
-    """Views with zeros for what is not seen, what is seen (f, k), and weights (f, k, 3, 3), zeros for the others."""
+    """Views with zeros for unseen balls, seen (f, k), and weights (f, k, 3, 3), zeros for unseen balls."""
     views = np.array(views, dtype=np.float64)
     if views.ndim != 3 or views.shape[1] < FEWEST or views.shape[2] != 3 or np.isinf(views).any():
         raise TargetCalibrationError(
@@ -233,7 +233,7 @@ def _start(name: str, views: FloatArray, seen: BoolArray, enough: BoolArray) -> 
     with np.errstate(all="ignore"):
         middle = np.nanmedian(distances[rows], axis=0)
         off = np.nanmean(np.abs(distances[rows] - middle), axis=(1, 2))
-    # the more balls the better, then the more usual
+    # the view with most balls, then the most typical one
     first = rows[np.lexsort((off, -seen[rows].sum(axis=1)))[0]]
     shape, known = np.where(seen[first][:, None], views[first], 0.0), seen[first].copy()
     for _ in range(_PROCRUSTES):
@@ -256,7 +256,7 @@ def _start(name: str, views: FloatArray, seen: BoolArray, enough: BoolArray) -> 
 
 
 def _poses(shape: FloatArray, views: FloatArray, seen: BoolArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The most likely poses of all views."""
+    """Maximum likelihood poses of all views."""
     count = len(views)
     scalar = np.trace(weights, axis1=2, axis2=3)
     translation: FloatArray
@@ -278,7 +278,7 @@ def _poses(shape: FloatArray, views: FloatArray, seen: BoolArray, weights: Float
 
 
 def _maximise(name: str, shape: FloatArray, views: FloatArray, seen: BoolArray, weights: FloatArray) -> _Fit:
-    """The most likely points and their covariance, both without the six degrees of freedom of the frame."""
+    """Maximum likelihood points and their covariance, without the six degrees of freedom of the frame."""
     count, balls = seen.shape
     for _ in range(_ITERATIONS):
         rotation, translation = _poses(shape, views, seen, weights)
@@ -313,9 +313,9 @@ def _maximise(name: str, shape: FloatArray, views: FloatArray, seen: BoolArray, 
 
 
 def _without_frame(shape: FloatArray) -> FloatArray:
-    """(3k, 3k - 6) an orthonormal basis of the changes of points that neither move nor turn them as a whole.
+    """(3k, 3k - 6) orthonormal basis of the changes of points without translation and rotation of the whole.
 
-    Gaschler (2011): eq. 4.14-4.17 remove the same six degrees of freedom by zeros.
+    Gaschler (2011): eq. 4.14-4.17 remove these six degrees of freedom by zeros.
     """
     balls = len(shape)
     motion = np.zeros((balls, 3, 6))
@@ -326,7 +326,7 @@ def _without_frame(shape: FloatArray) -> FloatArray:
 
 
 def _residuals(shape: FloatArray, views: FloatArray, seen: BoolArray, weights: FloatArray) -> FloatArray:
-    """(f, k, 3) metres in the target's frame, zeros for what is not seen."""
+    """(f, k, 3) residuals in the target's frame, metres; zeros for unseen balls."""
     rotation, translation = _poses(shape, views, seen, weights)
     missing = (views - shape @ rotation.swapaxes(1, 2) - translation[:, None]) @ rotation
     result: FloatArray = np.asarray(np.where(seen[..., None], missing, 0.0))
@@ -342,7 +342,7 @@ def _costs(shape: FloatArray, views: FloatArray, seen: BoolArray, weights: Float
 
 
 def _robust_unit(costs: FloatArray, degrees: IntArray) -> float:
-    """The variance of a coordinate, by the median of the views' costs."""
+    """The variance of a coordinate, from the median of the views' costs."""
     medians = np.array([chi_square_gate(int(degree), 0.5) for degree in degrees])
     return float(np.median(costs / medians))
 
@@ -350,7 +350,7 @@ def _robust_unit(costs: FloatArray, degrees: IntArray) -> float:
 def _flexibility(residuals: FloatArray, seen: BoolArray, covariance: FloatArray | None) -> FloatArray:
     """(k,) variance of a coordinate of each ball beyond its noise.
 
-    The pose takes six of the degrees of freedom of a view, evenly from all its balls.
+    The pose takes six of a view's degrees of freedom, spread evenly over its balls.
     """
     share = 1.0 - 2.0 / seen.sum(axis=1)
     squares = ((residuals**2).sum(axis=2)).sum(axis=0) / (3.0 * (share[:, None] * seen).sum(axis=0))
@@ -363,7 +363,7 @@ def _flexibility(residuals: FloatArray, seen: BoolArray, covariance: FloatArray 
 
 
 def _axes(name: str, shape: FloatArray) -> FloatArray:
-    """(3, 3) the rows are the axes of the target's frame.
+    """(3, 3) matrix whose rows are the axes of the target's frame.
 
     Gaschler (2011): eq. 4.14-4.17, the rotation of a QR decomposition with positive signs on R's diagonal.
     """

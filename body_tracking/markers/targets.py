@@ -1,4 +1,4 @@
-"""A target: balls that keep their places to each other."""
+"""A target: a rigid arrangement of balls."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Target:
     Attributes:
         name: of the target.
         points: (k, 3) centres of the balls in the target's frame, metres.
-        covariance: (3k, 3k) of the points, square metres; zeros for a geometry that is known.
+        covariance: (3k, 3k) of the points, square metres; zeros for an exactly known geometry.
         diameter: of the balls, metres.
     """
 

@@ -15,9 +15,9 @@ from body_tracking.markers.recognition import RecognitionError, check_targets
 from body_tracking.markers.targets import Target
 
 MAX_BALLS: Final = 32
-"""Of a target; the covariance of so many has nine thousand numbers."""
+"""Largest number of balls of a target; the covariance then has nine thousand numbers."""
 _MAX_SIZE: Final = 10.0
-"""Metres."""
+"""Largest coordinate and diameter, metres."""
 
 _HEADER = """\
 # Targets written by body_tracking: points are the centres of the balls in the target's frame (origin at their
@@ -27,11 +27,11 @@ _HEADER = """\
 
 
 class TargetsFileError(BodyTrackingError):
-    """A file of targets cannot be read or written."""
+    """Raised for a file of targets that cannot be read or written."""
 
 
 def save_targets(targets: Sequence[Target], path: Path) -> None:
-    """Write targets; the file is replaced as a whole or not at all.
+    """Write targets; replaces the file atomically.
 
     Raises:
         RecognitionError: invalid targets.
@@ -53,7 +53,7 @@ def load_targets(path: Path) -> list[Target]:
     """Read targets.
 
     Raises:
-        TargetsFileError: the file is missing, is not YAML, or lacks or misstates a value; the text names it.
+        TargetsFileError: the file is missing, is not YAML, or lacks or misstates a value; the message names the value.
     """
     try:
         data = files.read_yaml(path)

@@ -1,6 +1,6 @@
-"""The motion of one target: a Kalman filter of a constant velocity, which says where to look for its balls.
+"""Motion of one target: a Kalman filter with constant velocity, which predicts where its balls are.
 
-A target has few numbers: compiled, a step takes a tenth of the time that numpy's calls take.
+The state is small: a compiled step takes a tenth of the time of numpy calls.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from body_tracking.markers.targets import Target
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """How targets move.
+    """Process noise and initial uncertainty of targets' motion.
 
     Attributes:
-        acceleration: m/s^2, standard deviation of what is constant between two frames.
-        angular_acceleration: rad/s^2.
+        acceleration: m/s^2, standard deviation, constant between two frames.
+        angular_acceleration: rad/s^2, likewise.
         speed: m/s, standard deviation when a target is recognised.
-        angular_speed: rad/s.
-        coast: seconds for which a target that is not seen is predicted.
+        angular_speed: rad/s, likewise.
+        coast: seconds for which an unseen target is predicted.
     """
 
     acceleration: float = 15.0
@@ -40,14 +40,14 @@ class Motion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """The motion of a target.
+    """State of a target's filter.
 
     Attributes:
         rotation: (3, 3) and
-        translation: (3,) metres, its pose.
+        translation: (3,) metres: its pose.
         velocity: (6,) m/s, and rad/s about fixed axes.
         covariance: (12, 12) of the pose, as :attr:`TargetPose.covariance`, and of the velocity.
-        seen_ns: when it was last seen, nanoseconds.
+        seen_ns: capture time of the last measurement, nanoseconds.
     """
 
     rotation: FloatArray
@@ -58,28 +58,28 @@ class Track:
 
     @classmethod
     def begun(cls, pose: TargetPose, motion: Motion) -> Track:
-        """That of a target that was recognised."""
+        """Initial track of a recognised target."""
         covariance = np.diag(np.repeat([0.0, 0.0, motion.speed**2, motion.angular_speed**2], 3))
         covariance[:6, :6] = pose.covariance
         return cls(pose.rotation, pose.translation, np.zeros(6), covariance, pose.stamp_ns)
 
     def predicted(self, elapsed_ns: int, motion: Motion) -> Track:
-        """After so much time."""
+        """The track after ``elapsed_ns``."""
         noise = np.array([motion.acceleration**2, motion.angular_acceleration**2])
         moved = _predicted(*self._numbers, elapsed_ns / NANOSECONDS, noise)
         return Track(*moved, self.seen_ns)
 
     def updated(self, pose: tuple[FloatArray, FloatArray, FloatArray], stamp_ns: int) -> Track:
-        """With a pose as a measurement, rotation, translation, covariance: Kalman's update in Joseph's form."""
+        """The track after a measured pose (rotation, translation, covariance): Kalman update in Joseph form."""
         return Track(*_updated(*self._numbers, *pose), stamp_ns)
 
     def distance(self, pose: tuple[FloatArray, FloatArray, FloatArray]) -> float:
-        """Squared Mahalanobis distance of a pose from the predicted one; infinity where its covariance is invalid."""
+        """Squared Mahalanobis distance of a pose from the predicted one; infinity if the covariance is invalid."""
         return float(_distance(self.rotation, self.translation, self.covariance, *pose))
 
     def gates(self, target: Target, points: Points) -> BoolArray:
-        """(k, n) whether a point may be a ball of the target, by where the ball is expected."""
-        # the balls' own covariance turns with the target, which its trace bounds
+        """(k, n) whether a point lies within the gate of a ball's predicted position."""
+        # the trace bounds the balls' own covariance for any rotation of the target
         own = target.covariance.diagonal().reshape(-1, 3).sum(axis=1)
         return _gates(target.points @ self.rotation.T, own, *self._numbers[1::2], points.positions, points.covariance)
 
@@ -97,7 +97,7 @@ def _predicted(
     elapsed: float,
     noise: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """The numbers of a track after ``elapsed`` s; noise: (2,) squares of the accelerations."""
+    """The state after ``elapsed`` s; noise: (2,) variances of the accelerations."""
     moved = covariance.copy()
     for i in range(6):  # loops: array expressions take the compiler five times as long
         for j in range(6):
@@ -119,7 +119,7 @@ def _predicted(
 def _innovation(
     rotation: FloatArray, translation: FloatArray, measured_rotation: FloatArray, measured_translation: FloatArray
 ) -> FloatArray:
-    """(6,) from the predicted to the measured pose."""
+    """(6,) step from the predicted to the measured pose."""
     result = np.empty(6)
     result[:3] = measured_translation - translation
     result[3:] = turn_between(rotation, measured_rotation)
@@ -159,7 +159,7 @@ def _updated(
     measured_translation: FloatArray,
     noise: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """The numbers of a track with a measured pose and its covariance (6, 6): :meth:`Track.updated`."""
+    """The state after a measured pose with covariance (6, 6): :meth:`Track.updated`."""
     inverse, gain, left = np.empty((6, 6)), np.empty((12, 6)), np.empty((12, 12))
     inverse_of(covariance[:6, :6] + noise, inverse)
     innovation = _innovation(rotation, translation, measured_rotation, measured_translation)
@@ -201,7 +201,7 @@ def _gates(
     positions: FloatArray,
     noise: FloatArray,
 ) -> BoolArray:
-    """(k, n) of :meth:`Track.gates`, of balls (k, 3) from the target's origin with variances (k,) of their own."""
+    """(k, n) of :meth:`Track.gates`; arms (k, 3): balls from the target's origin; own (k,): their variances."""
     gates = np.zeros((len(arms), len(positions)), dtype=np.bool_)
     jacobian = np.zeros((3, 6))
     jacobian[0, 0] = jacobian[1, 1] = jacobian[2, 2] = 1.0

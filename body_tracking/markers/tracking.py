@@ -1,4 +1,4 @@
-"""Targets from frame to frame: predicted, matched within gates, recognised anew where they are lost."""
+"""Tracking of targets: prediction, matching within gates, recognition of lost targets."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ from body_tracking.markers.track import Motion as Motion
 from body_tracking.markers.track import Track
 
 _INNOVATION_GATE: Final = chi_square_gate(6, 1e-6)
-"""Squared Mahalanobis distance of a pose from its prediction."""
+"""Largest squared Mahalanobis distance of a pose from its prediction."""
 
 
 class TrackingError(BodyTrackingError):
-    """Parameters are invalid."""
+    """Raised for invalid parameters."""
 
 
 @dataclass(slots=True)
 class Counters:
-    """What happened so far.
+    """Counts since the start.
 
     Attributes:
-        frames: taken.
+        frames: processed frames.
         tracked: poses found by prediction.
         recognised: poses found by recognition.
-        ambiguous: targets in a frame that were left out because two interpretations remained.
-        missed: targets in a frame that were not found, without the ambiguous ones.
-        given_up: frames whose search did not end in time.
-        repeated: frames with the stamp of the one before, which are left out.
-        resets: times that the stamps ran backwards, or the points' frame became another.
+        ambiguous: targets left out of a frame because two interpretations remained.
+        missed: targets not found in a frame, without the ambiguous ones.
+        given_up: frames whose search exceeded the deadline.
+        repeated: frames with the stamp of the previous one, which are ignored.
+        resets: backward jumps of the stamps, or changes of the points' frame.
     """
 
     frames: int = 0
@@ -54,15 +54,15 @@ class Counters:
 
 
 class TargetTracker:
-    """Poses of targets, frame by frame.
+    """Tracks the poses of targets, frame by frame.
 
-    The Kalman filter of a constant velocity only predicts where to look: a pose that is given is the most likely one
-    for the points of its own frame.
+    The Kalman filter with constant velocity only predicts where to search: the pose returned is the maximum likelihood
+    pose for the points of its own frame.
 
     Args:
         targets: see :class:`~body_tracking.markers.recognition.Recogniser`.
-        motion: how they move.
-        deadline: seconds of a frame after which to give up; never when None.
+        motion: process noise.
+        deadline: seconds per frame after which the search gives up; None for no limit.
 
     Raises:
         RecognitionError: invalid targets.
@@ -89,10 +89,10 @@ class TargetTracker:
         self._stamp_ns = None
 
     def update(self, points: Points) -> tuple[TargetPose, ...]:
-        """The poses of the targets that are certain in a frame.
+        """The poses of the certain targets in a frame.
 
         Raises:
-            RecognitionError: points that are not finite, or without a covariance each.
+            RecognitionError: points that are not finite, or without a valid covariance.
         """
         check_points(points)
         until = Deadline(self._deadline)
@@ -128,7 +128,7 @@ class TargetTracker:
         return (*(target_pose(name, points, candidate) for name, candidate in chosen.items()), *recognised)
 
     def _predict(self, stamp_ns: int) -> None:
-        """Move all tracks to a time; those that were not seen for too long are lost."""
+        """Predict all tracks to a time; drop those unseen for too long."""
         elapsed_ns = 0 if self._stamp_ns is None else stamp_ns - self._stamp_ns
         self._stamp_ns = stamp_ns
         for name, track in list(self._tracks.items()):
@@ -138,7 +138,7 @@ class TargetTracker:
                 self._tracks[name] = track.predicted(elapsed_ns, self._motion)
 
     def _candidates(self, points: Points, until: Deadline) -> dict[str, list[Candidate]]:
-        """Ways to see the tracked targets near where they are expected."""
+        """Candidates of the tracked targets near their predictions."""
         gates = {name: track.gates(self._targets[name], points) for name, track in self._tracks.items()}
         candidates = self._obvious(points, gates, until)
         gates = {name: gate for name, gate in gates.items() if name not in candidates}
@@ -152,7 +152,7 @@ class TargetTracker:
         pairs = near_pairs(points.positions[rows], points.covariance[rows], reach)
         pairs = Pairs(rows[pairs.first], rows[pairs.second], pairs.low, pairs.high)
         searches = {name: self._search(name, pairs, gate, until) for name, gate in gates.items()}
-        # one ball of each may be hidden; of targets that are not found so, one more each time
+        # one ball of each target may be hidden; if none is found, allow one more hidden ball each time
         fewest = {name: max(FEWEST, len(self._targets[name].points) - 1) for name in searches}
         left = list(searches)
         while left:
@@ -164,9 +164,9 @@ class TargetTracker:
         return candidates
 
     def _obvious(self, points: Points, gates: dict[str, BoolArray], until: Deadline) -> dict[str, list[Candidate]]:
-        """The targets of which one ball at most is hidden, and of no other has another point within its gate.
+        """Targets with at most one hidden ball and exactly one point in the gate of every other ball.
 
-        Where the points fit, there is no other way to see the target, and nothing to search.
+        If these points fit, the candidate is unique and no search is needed.
         """
         found = {}
         for name, gate in gates.items():
@@ -178,7 +178,7 @@ class TargetTracker:
         return {name: each for name, each in expected.items() if each}
 
     def _expected(self, name: str, fits: list[Candidate]) -> list[Candidate]:
-        """Those within the gate of the prediction, with the cost of their distance from it, the likeliest first."""
+        """Candidates within the gate of the prediction, their cost increased by the distance, the likeliest first."""
         distances = [self._tracks[name].distance(_pose(fit)) for fit in fits]
         expected = [
             replace(fit, cost=fit.cost + distance)
@@ -190,7 +190,7 @@ class TargetTracker:
     def _search(
         self, name: str, pairs: Pairs, gate: BoolArray, until: Deadline
     ) -> Callable[[int], Iterator[tuple[int, ...]]]:
-        """Assignments of points within a target's gates to at least so many of its balls."""
+        """Search for assignments of points within a target's gates, as a function of the least number of balls."""
         shape = self._recogniser.shapes[name]
         inside: BoolArray = np.asarray(gate.any(axis=0))
         both: BoolArray = inside[pairs.first] & inside[pairs.second]
@@ -201,7 +201,7 @@ class TargetTracker:
     def _recognise(
         self, points: Points, chosen: dict[str, Candidate], unsure: set[str], until: Deadline
     ) -> tuple[tuple[TargetPose, ...], set[str]]:
-        """Search for the targets that are lost among the points that are left."""
+        """Search for the lost targets among the unused points."""
         lost = [name for name in self._targets if name not in chosen and name not in unsure]
         used = [point for candidate in chosen.values() for point in candidate.assignment if point >= 0]
         rows = np.delete(np.arange(len(points.positions)), used)
@@ -219,7 +219,7 @@ class TargetTracker:
 
 
 def prepare() -> None:
-    """Compile the loops, or load them, before the first points: a target, seen and seen again."""
+    """Compile the loops, or load them, before the first points: a target seen twice."""
     balls = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.07, 0.0], [0.02, 0.03, 0.05]])
     tracker = TargetTracker([Target("", balls, np.zeros((12, 12)))])
     noise = np.tile(1e-6 * np.eye(3), (4, 1, 1))
@@ -232,7 +232,7 @@ def _pose(candidate: Candidate) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _believed(target: Target, points: Points, candidate: Candidate, track: Track) -> bool:
-    """Whether chance does not explain a candidate with hidden balls, among the poses within the gate."""
+    """Whether a candidate with hidden balls is too unlikely to arise by chance among the poses within the gate."""
     if min(candidate.assignment) >= 0:
         return True
     prior = track.covariance[:6, :6]

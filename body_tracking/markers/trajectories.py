@@ -1,7 +1,6 @@
-"""Points of other motion capture systems, from C3D files and from exports of Motive, as those of the rig's cameras.
+"""Points of other motion capture systems from C3D files and Motive exports, in the form of the rig's points.
 
-They enter where those of :mod:`body_tracking.markers.triangulation` do. Labels are dropped, except where a target is
-measured by them.
+They replace those of :mod:`body_tracking.markers.triangulation`. Labels are dropped, except for measuring a target.
 """
 
 from __future__ import annotations
@@ -24,8 +23,7 @@ C3D_SUFFIX: Final = ".c3d"
 FRAME: Final = "mocap"
 """The frame of points from other systems."""
 DEFAULT_NOISE: Final = 5e-4
-"""Metres, standard deviation of each coordinate: between what vendors of motion capture systems state (0.2 mm) and
-balls on skin."""
+"""Metres, standard deviation of each coordinate: between vendors' specifications (0.2 mm) and balls on skin."""
 EMPTY: Final = "frames without a point"
 BACKWARDS: Final = "frames whose time does not advance"
 FAR: Final = "points too far away"
@@ -40,10 +38,10 @@ class Trajectories:
     """Points over time.
 
     Attributes:
-        labels: of the first points; further ones have none.
-        positions: (n, p, 3) metres, NaN where a point is not seen; z up where the file says which axis points up.
+        labels: of the first points; further points have none.
+        positions: (n, p, 3) metres, NaN where a point is unseen; z up if the file states its vertical axis.
         stamps_ns: n capture times in nanoseconds, by the file's clock.
-        warnings: a line for each irregularity.
+        warnings: one line per irregularity.
     """
 
     labels: tuple[str, ...]
@@ -55,7 +53,7 @@ class Trajectories:
         """(n, k, 3) positions of the points with these labels, in their order.
 
         Raises:
-            TrajectoryError: no point, or more than one, has such a label; the text lists the file's.
+            TrajectoryError: a label of no point or of several; the message lists the file's labels.
         """
         for label in labels:
             if self.labels.count(label) != 1:
@@ -66,7 +64,7 @@ class Trajectories:
 
 
 def labels_in(text: str) -> tuple[str, ...]:
-    """The labels in a list with commas."""
+    """The labels in a comma-separated list."""
     return tuple(each.strip() for each in text.split(",") if each.strip())
 
 
@@ -120,7 +118,7 @@ def read_trajectories(path: Path, partial: bool = False) -> Trajectories:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedPoints:
-    """The points of one frame, at the time by the file's clock."""
+    """The points of one frame; ``received_ns`` is the file's time."""
 
     sensor: str
     received_ns: int
@@ -128,18 +126,18 @@ class RecordedPoints:
 
 
 class TrajectoryRecording:
-    """The frames of a file, in its order, without labels.
+    """Iterates over the frames of a file, without labels.
 
     Args:
         path: a file for which :func:`is_trajectory_file` holds.
-        labels: of the points that are read; all, also those without a label, when empty.
+        labels: of the points to read; if empty all points, also those without a label.
         noise: standard deviation of each coordinate, metres.
         partial: read a truncated file up to its last whole frame.
 
     Attributes:
         problems: counts of irregularities, by kind.
-        warnings: a line for each missing part.
-        progress: share of the file that has been read, 0 to 1.
+        warnings: one line per missing part.
+        progress: share of the file read, 0 to 1.
 
     Raises:
         BodyTrackingError: while iterating, if the file cannot be read or lacks a label.

@@ -1,4 +1,4 @@
-"""The loops of :mod:`body_tracking.markers.joint_tree` over frames and joints, compiled: one frame has few numbers."""
+"""Compiled loops of :mod:`body_tracking.markers.joint_tree` over frames and joints."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
 from body_tracking.markers.joint_model import SIZE
 
 Numbers = tuple[IntArray, IntArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray]
-"""Of j joints: (j,) parents, numbers of coordinates and first coordinates; parent_rotation (j, 3, 3), parent_centre
-(j, 3), child_rotation, child_centre."""
+"""Arrays of j joints: (j,) parents, numbers of coordinates and first coordinates; parent_rotation (j, 3, 3),
+parent_centre (j, 3), child_rotation (j, 3, 3), child_centre (j, 3)."""
 _BALL, _UNIVERSAL = 3, 2
 """Numbers of coordinates."""
 
@@ -140,7 +140,7 @@ def errors(
     translations: FloatArray,
     result: FloatArray,
 ) -> None:
-    """Write (n, m, 6) translation and rotation from the tree's poses to the measured; zeros without one."""
+    """Write (n, m, 6) translation and rotation from the tree's poses to the measured ones; zeros where unseen."""
     for n in range(len(seen)):
         for m in range(seen.shape[1]):
             if seen[n, m]:
@@ -160,19 +160,20 @@ def adjusted(
     converged: float,
     iterations: int,
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Move the posture of one frame, in place, to that of the least squares, by Gauss-Newton.
+    """Fit the posture of one frame, in place, to measured poses by Gauss-Newton.
 
     Args:
         numbers: of m - 1 joints.
-        posture: rotation (1, 3, 3), translation (1, 3), turns (j, 1, 3, 3), near to the solution.
+        posture: rotation (1, 3, 3), translation (1, 3), turns (j, 1, 3, 3), near the solution.
         measured: rotations (1, m, 3, 3), translations (1, m, 3), seen (1, m), whitening (1, m, 6, 6).
         size: number of coordinates.
-        loose: information of a coordinate's step.
-        converged: radians and metres of a step after which there is none.
-        iterations: at most.
+        loose: prior information of a coordinate's step.
+        converged: step in radians and metres below which the iteration ends.
+        iterations: largest number.
 
     Returns:
-        (6 m, size + 12 j) whitened derivatives, (size, size) covariance of the coordinates, and the squared errors.
+        (6 m, size + 12 j) whitened derivatives, (size, size) covariance of the coordinates, and the sum of squared
+        errors.
     """
     rotation, translation, turns = posture
     poses, places, seen, whitening = measured
@@ -183,7 +184,7 @@ def adjusted(
     information, covariance, step = np.empty((size, size)), np.empty((size, size)), np.empty((1, size))
     for count in range(iterations):
         place(numbers, rotation, translation, turns, rotations, translations)
-        # the first step is never the last: those by the joints' parameters are not needed yet
+        # the first step is never the last one, so it needs no derivatives by the joints' parameters
         parameters = count > 0
         derivative = np.zeros((1, targets, 6, width))
         differentiate(numbers, turns, rotations, size, parameters, derivative)
@@ -192,7 +193,7 @@ def adjusted(
             for i in range(6):
                 row = white[6 * m + i]
                 row[:], residual[6 * m + i] = 0.0, 0.0
-                for k in range(i + 1):  # the whitening is a triangle
+                for k in range(i + 1):  # the whitening is lower triangular
                     weight = whitening[0, m, i, k]
                     residual[6 * m + i] += weight * error[0, m, k]
                     for column in range(width if parameters else size):
@@ -216,7 +217,7 @@ def adjusted(
         moved(numbers, step, rotation, translation, turns)
         if parameters and largest < converged:
             break
-    # the last step is too small for derivatives to change by it
+    # squared errors after the last step, by linearisation
     squares = 0.0
     for n in range(6 * targets):
         left = residual[n]

@@ -1,8 +1,8 @@
-"""From balls in images to points in space (Gaschler 3.2): matching along epipolar lines, and triangulation.
+"""From balls in images to points in space (Gaschler 3.2): correspondence by epipolar lines, and triangulation.
 
-Two cameras: the optimal correction of Hartley and Sturm (1997), then one Gauss-Newton step that gives each centroid
-the weight of its covariance. More cameras: weighted least squares over all of a point's rays. The covariance of a
-point is that of the centroids' noise; what the calibration is wrong by is :func:`sensitivity`'s.
+Two cameras: the optimal correction of Hartley and Sturm (1997), then one Gauss-Newton step that weights each centroid
+by its covariance. More cameras: weighted least squares over all rays of a point. The covariance of a point is from the
+centroids' noise; :func:`sensitivity` gives the effect of the calibration error.
 """
 
 from __future__ import annotations
@@ -22,19 +22,20 @@ from body_tracking.markers.rays import Rays, RigRays, TriangulationError, make_r
 from body_tracking.markers.rig import Rig, parallel_cameras
 
 _STEPS: Final = 3
-"""Gauss-Newton steps for three cameras or more: from where two rays meet, each leaves about a thousandth."""
+"""Gauss-Newton steps for three or more cameras: from the intersection of two rays, each reduces the error to about a
+thousandth."""
 
 
 @dataclass(frozen=True, slots=True)
 class TriangulationSettings:
-    """When balls of several cameras are the same ball.
+    """Limits of correspondence between balls of several cameras.
 
     Attributes:
-        gate: how far a ball may be from another's epipolar line, or from where other cameras say it is, in standard
-            deviations of noise and calibration.
-        alternatives: most partners of a ball in another camera, the nearest first.
-        nearest: metres before each camera.
-        farthest: metres before each camera.
+        gate: largest distance of a ball from another's epipolar line, or from its prediction by other cameras, in
+            standard deviations of noise and calibration.
+        alternatives: largest number of partners of a ball in another camera, the nearest first.
+        nearest: least depth in each camera, metres.
+        farthest: largest depth in each camera, metres.
     """
 
     gate: float = field(
@@ -59,7 +60,7 @@ _DEFAULT: Final = TriangulationSettings()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """Balls of two cameras that may be the same: indices among all balls, and their epipolar distances.
+    """Possibly corresponding balls of two cameras: indices among all balls, and epipolar distances.
 
     Attributes:
         first: (n,) and
@@ -73,21 +74,22 @@ class Pairs:
 
 
 def triangulate(rig: Rig, balls: Sequence[ImageBalls], settings: TriangulationSettings = _DEFAULT) -> Points:
-    """The points that the cameras of a rig see at one time.
+    """Triangulate the balls of a rig's cameras at one time.
 
-    A ball on several others' epipolar lines belongs to several points: where three cameras or more agree on a point,
-    it takes its balls; otherwise all alternatives are given, and share indices in :attr:`Points.balls`.
+    A ball on the epipolar lines of several others belongs to several points. Where three or more cameras agree on a
+    point, its balls are reserved for it; otherwise all alternatives are returned, with shared indices in
+    :attr:`Points.balls`.
 
     Args:
         rig: the cameras.
-        balls: of the cameras, at the same time; cameras may be missing.
-        settings: what is taken for a ball.
+        balls: of the cameras, at one time; cameras may be missing.
+        settings: limits of correspondence.
 
     Returns:
         Points in the frame of the rig's first camera, with the stamp of the first image.
 
     Raises:
-        TriangulationError: no images, an unknown camera, one twice, other shapes, or numbers that are not finite.
+        TriangulationError: no images, a camera unknown or given twice, other shapes, or numbers that are not finite.
     """
     if not balls:
         raise TriangulationError("no images to triangulate from")
@@ -113,7 +115,7 @@ def triangulate(rig: Rig, balls: Sequence[ImageBalls], settings: TriangulationSe
 
 
 def prepare() -> None:
-    """Compile the loops, or load them, before the first images: a point before two parallel cameras."""
+    """Compile the loops, or load them, before the first images: a point in front of two parallel cameras."""
     rig = parallel_cameras()
     balls = [
         ImageBalls(0, camera.frame_id, np.array([[column, 240.0]]), np.ones(1), np.eye(2)[None])
@@ -123,7 +125,7 @@ def prepare() -> None:
 
 
 def epipolar_pairs(geometry: RigRays, rays: Rays, a: int, b: int, settings: TriangulationSettings) -> Pairs:
-    """Balls of cameras a and b within the gate of each other's epipolar lines, few enough for each ball of both.
+    """Balls of cameras a and b within the gate of each other's epipolar lines, at most ``alternatives`` per ball.
 
     Gaschler (2011): figure 3.2.
     """
@@ -141,7 +143,7 @@ def epipolar_pairs(geometry: RigRays, rays: Rays, a: int, b: int, settings: Tria
     size = np.where(np.isfinite(distance), np.abs(distance), np.inf)
     good = size < settings.gate
     if max(good.sum(axis=0).max(initial=0), good.sum(axis=1).max(initial=0)) > settings.alternatives:
-        # the nearest few of each ball of both
+        # keep pairs that are among the nearest of both balls
         by_row = np.argsort(np.argsort(size, axis=1), axis=1) < settings.alternatives
         by_column = np.argsort(np.argsort(size, axis=0), axis=0) < settings.alternatives
         good &= by_row & by_column
@@ -157,20 +159,20 @@ def _epipolar_distances(
     b: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
     distance: FloatArray,
 ) -> None:
-    """Write the distances (n_a, n_b) of two cameras' balls from each other's epipolar lines, standard deviations.
+    """Write the epipolar distances (n_a, n_b) of two cameras' balls, in standard deviations.
 
     Args:
-        baseline: (3,) from the first camera to the second.
-        shift: (3, r) what the calibration's unknowns add to it.
+        baseline: (3,) from the first camera to the second, metres.
+        shift: (3, r) effect of the calibration's unknowns on the baseline.
         a: rotation (3, 3) of the first camera; directions, spread and flat_factor of its balls.
-        b: of the second.
-        distance: is written.
+        b: of the second camera, likewise.
+        distance: written.
     """
     a_turn, a_directions, a_spread, a_factor = a
     b_turn, b_directions, b_spread, b_factor = b
     by_b, by_a, across = np.empty(3), np.empty(3), np.empty(3)
     for i in range(len(a_directions)):
-        # the volume that two rays span with the baseline c, d_b . (c x d_a), and its derivative by either direction
+        # the volume spanned by two rays and the baseline c, d_b . (c x d_a), and its derivative by each direction
         _cross(baseline, a_directions[i], by_b)
         b0 = by_b[0] * b_turn[0, 0] + by_b[1] * b_turn[0, 1] + by_b[2] * b_turn[0, 2]
         b1 = by_b[0] * b_turn[1, 0] + by_b[1] * b_turn[1, 1] + by_b[2] * b_turn[1, 2]
@@ -183,7 +185,7 @@ def _epipolar_distances(
             for k in range(2):
                 variance += (a0 * a_spread[i, 0, k] + a1 * a_spread[i, 1, k]) ** 2
                 variance += (b0 * b_spread[j, 0, k] + b1 * b_spread[j, 1, k]) ** 2
-            # a pixel that stays moves its ray against what moves a point's image
+            # with a fixed pixel, the ray moves opposite to the image of a fixed point
             _cross(a_directions[i], direction, across)
             for k in range(shift.shape[1]):
                 moves = across[0] * shift[0, k] + across[1] * shift[1, k] + across[2] * shift[2, k]
@@ -203,7 +205,7 @@ def _cross(a: FloatArray, b: FloatArray, product: FloatArray) -> None:
 
 
 def _two_rays(geometry: RigRays, rays: Rays, a: int, b: int, pairs: Pairs, optimal: bool) -> FloatArray:
-    """(n, 3) where two rays meet: after their optimal correction, or where they pass each other."""
+    """(n, 3) intersections of two rays: after their optimal correction, or midpoints of their shortest distance."""
     if not len(pairs.first):
         return np.zeros((0, 3))
     first, second = rays.directions[pairs.first], rays.directions[pairs.second]
@@ -225,9 +227,9 @@ def _two_rays(geometry: RigRays, rays: Rays, a: int, b: int, pairs: Pairs, optim
 
 @compiled
 def _meet(start: FloatArray, other: FloatArray, first: FloatArray, second: FloatArray, middle: FloatArray) -> None:
-    """Write the points (n, 3) half way between where rays are nearest: least squares over the two lengths.
+    """Write the midpoints (n, 3) of the shortest segments between rays.
 
-    Behind the cameras, and of parallel rays: NaN, which no range contains.
+    NaN behind the cameras and for parallel rays; NaN fails every range check.
     """
     for n in range(len(first)):
         ff = fs = ss = fb = sb = 0.0
@@ -252,7 +254,7 @@ def _directions(geometry: RigRays, camera: int, flat: FloatArray) -> FloatArray:
 
 
 def _in_range(geometry: RigRays, positions: FloatArray, seen: BoolArray, settings: TriangulationSettings) -> BoolArray:
-    """(n,) which points are in the range of all cameras that see them."""
+    """(n,) whether points are within the depth range of all cameras that see them."""
     depth = positions @ geometry.rotations[:, 2].T + geometry.translations[:, 2]
     return np.asarray((~seen | ((depth > settings.nearest) & (depth < settings.farthest))).all(axis=1))
 
@@ -260,7 +262,7 @@ def _in_range(geometry: RigRays, positions: FloatArray, seen: BoolArray, setting
 def _refined(
     geometry: RigRays, rays: Rays, members: IntArray, positions: FloatArray, steps: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Points (n, 3) after Gauss-Newton on reprojection errors with the centroids' weights, and covariance (n, 3, 3)."""
+    """Points (n, 3) after Gauss-Newton on weighted reprojection errors, and their covariance (n, 3, 3)."""
     positions, covariance = np.array(positions), np.empty((len(members), 3, 3))
     pose = geometry.rotations, geometry.translations
     _gauss_newton(*pose, rays.flat, rays.weight, members, steps, positions, covariance)
@@ -278,7 +280,7 @@ def _gauss_newton(
     positions: FloatArray,
     covariance: FloatArray,
 ) -> None:
-    """Move the positions (n, 3) by so many steps, and write their covariance (n, 3, 3) before the last."""
+    """Move the positions (n, 3) by Gauss-Newton steps; write their covariance (n, 3, 3) at the last linearisation."""
     information, gradient, derivative = np.empty((3, 3)), np.empty(3), np.empty((2, 3))
     for n in range(len(members)):
         for _ in range(steps):
@@ -333,9 +335,10 @@ def _projected(geometry: RigRays, positions: FloatArray) -> tuple[FloatArray, Fl
 def _agreed(
     geometry: RigRays, rays: Rays, members: IntArray, positions: FloatArray, settings: TriangulationSettings
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Points of three cameras or more: pairs of balls, completed by where the other cameras should see the point.
+    """Points of three or more cameras: pairs of balls, completed by balls near the predicted image in other cameras.
 
-    What three cameras agree on takes its balls, those that most cameras agree on and then the most likely first.
+    A point of three or more cameras reserves its balls; points with most cameras, then the most likely ones, come
+    first.
     """
     positions, covariance = _refined(geometry, rays, members, positions, 1)
     members = _completed(geometry, rays, members, positions, covariance, settings)
@@ -347,7 +350,7 @@ def _agreed(
     members, positions, covariance = members[near], positions[near], covariance[near]
     views = (members >= 0).sum(axis=1)
     errors = _errors(geometry, rays, members, positions)
-    free = np.ones(len(rays.balls) + 1, dtype=np.bool_)  # the last for balls that are not there
+    free = np.ones(len(rays.balls) + 1, dtype=np.bool_)  # the last entry is for index -1, a missing ball
     chosen = []
     for row in np.lexsort((errors / np.maximum(views, 1), -views)):
         mine = members[row]
@@ -367,13 +370,13 @@ def _completed(
     covariance: FloatArray,
     settings: TriangulationSettings,
 ) -> IntArray:
-    """Members (n, c) with the most likely ball of each other camera, where one is within the gate."""
+    """Members (n, c) with the most likely ball of each other camera added if it is within the gate."""
     members = np.array(members)
     if not len(members):
         return members
     made, by_point = _projected(geometry, positions)
     depth = positions @ geometry.rotations[:, 2].T + geometry.translations[:, 2]  # (n, c)
-    # derivative of the point by the calibration's unknowns, through the balls that it comes from
+    # derivative of the point by the calibration's unknowns, through its balls
     pulls = np.zeros((len(members), 3, geometry.translation_factor.shape[2]))
     for camera in range(members.shape[1]):
         rows = np.flatnonzero(members[:, camera] >= 0)
@@ -414,7 +417,7 @@ def _completed(
 def _moves(
     geometry: RigRays, rays: Rays, balls: IntArray, camera: int, flat: FloatArray, depth: FloatArray
 ) -> FloatArray:
-    """(n, 2, r) what the calibration's unknowns add to a point's image in a camera, against the ball's pixel."""
+    """(n, 2, r) effect of the calibration's unknowns on a point's image relative to the ball's pixel."""
     shift = geometry.translation_factor[camera]
     result: FloatArray = (
         rays.flat_factor[balls] + (shift[None, :2] - flat[:, :, None] * shift[None, 2:]) / depth[:, None, None]
@@ -433,22 +436,22 @@ def _errors(geometry: RigRays, rays: Rays, members: IntArray, positions: FloatAr
 
 
 def sensitivity(rig: Rig, positions: FloatArray, seen: BoolArray | None = None) -> FloatArray:
-    """How triangulated points move when the calibration's parameters are larger and the pixels stay.
+    """Derivative of triangulated points by the calibration's parameters at fixed pixels.
 
-    By the implicit function of the least squares problem at residuals of zero: with J the derivative of the pixels by
-    the point, and D by the parameters, it is ``-inv(J' J) J' D``. The calibration's part of the covariance of all
-    points together is ``S @ rig.covariance @ S.T`` for S of shape (3 n, p).
+    By the implicit function theorem for the least squares problem at zero residuals: with J the derivative of the
+    pixels by the point and D that by the parameters, it is ``-inv(J' J) J' D``. The calibration's part of the joint
+    covariance of all points is ``S @ rig.covariance @ S.T`` with S of shape (3 n, p).
 
     Args:
         rig: the cameras.
         positions: (n, 3) in the rig's frame, metres, in front of the cameras that see them.
-        seen: (n, c) which cameras see which point, ``points.balls >= 0``; all of them unless given.
+        seen: (n, c) which cameras see which point, ``points.balls >= 0``; None for all.
 
     Returns:
         (n, 3, p) metres per unit of each parameter of :class:`Rig`.
 
     Raises:
-        TriangulationError: other shapes, a point that fewer than two cameras see or that is not in front of them.
+        TriangulationError: other shapes, a point seen by fewer than two cameras or not in front of them.
     """
     count = len(rig.cameras)
     seen = np.ones((len(positions), count), dtype=np.bool_) if seen is None else seen

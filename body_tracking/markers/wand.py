@@ -1,9 +1,9 @@
-"""Calibration of the poses of many cameras by a wand that is waved: balls in a row, at known distances.
+"""Calibration of the poses of many cameras by waving a wand: balls in a row at known distances.
 
-The essential matrix of two cameras gives their poses to each other but for the scale, which the wand's length gives
-(Hartley and Zisserman 2004, section 9.6); a bundle adjustment over the cameras and the places of the balls fits
-everything together. The cameras' lenses are known from boards, as well as their covariance says: the adjustment moves
-them within it, so that the poses' covariance contains their errors.
+The essential matrix of two cameras gives their relative pose up to scale, and the wand's length gives the scale
+(Hartley and Zisserman 2004, section 9.6); a bundle adjustment over the cameras and the balls fits everything together.
+The lenses are known from boards, with a covariance: the adjustment moves them within it, so that the poses' covariance
+contains their errors.
 """
 
 from __future__ import annotations
@@ -25,21 +25,22 @@ from body_tracking.markers.rig import Rig
 from body_tracking.markers.spheres import sphere_centre_correction
 
 MOST_BALLS: Final = 8
-"""In an image in which a wand is looked for; it takes three of them at a time."""
+"""Largest number of balls in an image that is searched for a wand: the search takes all triples."""
 MIN_SHARED: Final = 20
-"""Balls that two cameras see at the same time; eight determine the essential matrix."""
+"""Least number of balls that two cameras see simultaneously; eight determine the essential matrix."""
 _OUTLIER: Final = (5.0, 0.5)
-"""A sighting is left out whose residual exceeds so many times the median and so many pixels."""
+"""A sighting is an outlier if its residual exceeds the first number times the median and the second number of
+pixels."""
 _ROUNDS: Final = 4
 _NOISE_GUESSED: Final = (0.7, 1.4)
-"""Estimated over expected noise, within which the adjustment is not repeated with the estimated one."""
+"""Ratio of estimated to expected noise within which the adjustment is not repeated with the estimate."""
 _RANSAC: Final = (0.9999, 2.0)
-"""Probability of success, and pixels from an epipolar line."""
+"""RANSAC: confidence, and inlier distance from an epipolar line in pixels."""
 _CV: Any = cv2
 
 
 class WandError(BodyTrackingError):
-    """Raised for an impossible wand, or cameras that did not see enough of it together."""
+    """Raised for an impossible wand, or cameras that share too few sightings of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,10 +49,10 @@ class Wand:
 
     Attributes:
         places: of the balls along the wand, metres, rising from 0; two balls or more.
-        deviation: standard deviation of its length; the scale of the rig inherits it.
+        deviation: standard deviation of its length, metres; the scale of the rig inherits it.
 
     Raises:
-        WandError: places that do not rise from 0, or no deviation.
+        WandError: places that do not rise from 0, or a deviation that is not positive.
     """
 
     places: tuple[float, ...]
@@ -70,9 +71,9 @@ class Wand:
         return Lengths(np.stack([first, second], axis=-1), places[second] - places[first], self.deviation)
 
     def order(self, pixels: FloatArray) -> IntArray | None:
-        """Which of three balls in an image is which of the wand's; None where they are in no row.
+        """Assign three balls in an image to the wand's; None if they are not in a row.
 
-        The two distances must differ by more than the depth varies along the wand in the image.
+        The ratio of the wand's two distances must exceed that of the depths along the wand.
 
         Args:
             pixels: (3, 2) in any order.
@@ -81,7 +82,7 @@ class Wand:
             (3,) indices: ``pixels[order]`` are the balls in the order of the wand.
 
         Raises:
-            WandError: the wand has not three balls, or they are spaced evenly; or other shapes.
+            WandError: the wand does not have three balls at uneven distances, or other shapes.
         """
         if len(self.places) != 3 or pixels.shape != (3, 2):
             raise WandError(f"{len(self.places)} balls of the wand, pixels {pixels.shape}; expected 3 and (3, 2)")
@@ -100,17 +101,17 @@ class Wand:
         return np.array([ends[0], middle, ends[1]], dtype=np.intp)
 
     def find(self, pixels: FloatArray) -> IntArray | None:
-        """The wand among the balls in an image.
+        """Find the wand among the balls in an image.
 
         Args:
             pixels: (n, 2) in any order.
 
         Returns:
-            (3,) indices of the balls in the order of the wand; None where no three balls are in a row, more than one
-            three are, or there are more than :data:`MOST_BALLS`.
+            (3,) indices of the balls in the order of the wand; None if no triple or more than one is in a row, or there
+            are more than :data:`MOST_BALLS`.
 
         Raises:
-            WandError: as of :meth:`order`.
+            WandError: as :meth:`order`.
         """
         if not 3 <= len(pixels) <= MOST_BALLS:
             return None
@@ -127,7 +128,7 @@ class WandCalibration:
     """A rig calibrated by a wand.
 
     Attributes:
-        rig: with its covariance, that of the wand's length included.
+        rig: with its covariance, which includes that of the wand's length.
         adjusted: the bundle adjustment.
         used: (m,) which sightings it used.
     """
@@ -144,19 +145,19 @@ def calibrate_wand(
     covariance: FloatArray | None = None,
     noise: float = 0.1,
 ) -> WandCalibration:
-    """Calibrate the poses of cameras to each other.
+    """Calibrate the relative poses of cameras.
 
     Args:
         cameras: two or more, with known lenses; the first one's frame is the rig's.
-        seen: balls of the wand, whose points are numbered along it.
+        seen: balls of the wand; points are numbered along it.
         wand: the wand.
         covariance: (p, p) of the cameras' parameters as in :class:`Rig`, of which those of the lenses are used; None
-            for lenses without error. With lenses 1 px off that are held fixed, the poses' errors are ten times the
+            for lenses without error. With lenses that are 1 px off and held fixed, the poses' errors are ten times the
             stated deviations.
         noise: first guess of the standard deviation of a ball's coordinate in an image, pixels.
 
     Raises:
-        BundleError: what is seen does not determine the poses.
+        BundleError: the sightings do not determine the poses.
         WandError: numbers that are not finite, unknown cameras or balls, cameras that share too few sightings.
     """
     _check(cameras, seen, wand)
@@ -174,7 +175,7 @@ def calibrate_wand(
         points = intersect(rig, seen.where(used), len(wand.places), flat[used])
         used &= np.isfinite(_pixels(rig, seen, points)).all(axis=-1)
         used &= _counts(seen, used) >= 2
-        # lenses are held in the first round: wrong sightings that are still there would bend them
+        # the first round holds the lenses: outliers would distort them
         free = poses if number == 0 else poses | prior.known
         adjusted = adjust_points(rig, points, seen.where(used), lengths, free, noise, prior)
         guessed = _NOISE_GUESSED[0] < adjusted.noise / noise < _NOISE_GUESSED[1]
@@ -185,7 +186,7 @@ def calibrate_wand(
         if number == _ROUNDS - 1 or (done and guessed and good.sum() == used.sum()):
             break
         used = good
-    # what the wand's length is wrong by is the same in all images, and scales the rig
+    # the error of the wand's length is constant in all images and scales the rig
     scaled = np.zeros(rig.size)
     for index, end in enumerate(projection.offsets(rig)[1:]):
         scaled[end - 3 : end] = rig.translations[index] * wand.deviation / wand.places[-1]
@@ -197,8 +198,8 @@ def centred(found: WandCalibration, seen: Sightings, diameter: float) -> Sightin
     """The sightings, moved from the centroids of the balls' images to the projections of the balls' centres.
 
     Args:
-        found: a first calibration by these sightings, for the depths of the balls; sightings that it left out stay.
-        seen: as they were found.
+        found: a first calibration by these sightings, for the depths of the balls; unused sightings stay.
+        seen: the detections.
         diameter: of the balls, metres.
     """
     rig, pixels = found.rig, np.array(seen.pixels)
@@ -211,7 +212,7 @@ def centred(found: WandCalibration, seen: Sightings, diameter: float) -> Sightin
 
 
 def _inliers(errors: FloatArray, used: BoolArray | bool = True) -> BoolArray:
-    """Which of these distances (n,) in pixels are no outliers; the median is that of those in use."""
+    """Which errors (n,) in pixels are inliers; the median is over the errors in use."""
     chosen = errors[np.isfinite(errors) & used]
     limit = max(_OUTLIER[0] * float(np.median(chosen)), _OUTLIER[1]) if len(chosen) else 0.0
     inliers: BoolArray = errors <= limit
@@ -219,16 +220,16 @@ def _inliers(errors: FloatArray, used: BoolArray | bool = True) -> BoolArray:
 
 
 def intersect(rig: Rig, seen: Sightings, points: int, flat: FloatArray | None = None) -> FloatArray:
-    """Points nearest to their rays, for the start of an adjustment.
+    """Points nearest to their rays, to initialise an adjustment.
 
     Args:
         rig: the cameras.
         seen: (m) sightings.
         points: number of points of the object.
-        flat: (m, 2) image coordinates without distortion, where they are known already.
+        flat: (m, 2) undistorted image coordinates, if known already.
 
     Returns:
-        (v, points, 3) metres; zeros for a point that fewer than two rays go through.
+        (v, points, 3) metres; zeros for a point with fewer than two rays.
     """
     flat = _flat(rig.cameras, seen) if flat is None else flat
     rays = np.concatenate([flat, np.ones_like(flat[:, :1])], axis=-1)
@@ -259,7 +260,7 @@ def _check(cameras: Sequence[Camera], seen: Sightings, wand: Wand) -> None:
 
 
 def _counts(seen: Sightings, used: BoolArray) -> IntArray:
-    """(m,) how many cameras see the ball of each sighting, by the sightings that are used."""
+    """(m,) number of used sightings of each sighting's ball at its instant."""
     key = seen.views * (int(seen.points.max()) + 1) + seen.points
     counts: IntArray = np.bincount(key[used], minlength=int(key.max()) + 1)[key]
     return counts
@@ -274,7 +275,7 @@ def _flat(cameras: Sequence[Camera], seen: Sightings) -> FloatArray:
 
 
 def _pixels(rig: Rig, seen: Sightings, points: FloatArray) -> FloatArray:
-    """(m, 2) where each sighting's ball should be; NaN behind the camera, and for balls beyond the points."""
+    """(m, 2) predicted pixel of each sighting's ball; NaN behind the camera, and for views beyond ``points``."""
     inside = seen.views < len(points)
     places = np.where(inside[:, None], points[np.where(inside, seen.views, 0), seen.points], np.nan)
     pixels: FloatArray = rig.project(places)[seen.cameras, np.arange(len(places))]
@@ -284,7 +285,7 @@ def _pixels(rig: Rig, seen: Sightings, points: FloatArray) -> FloatArray:
 def _camera_poses(
     cameras: Sequence[Camera], seen: Sightings, flat: FloatArray, lengths: Lengths
 ) -> tuple[FloatArray, FloatArray]:
-    """Poses (c, 3, 3), (c, 3) from the first camera on, along pairs that share most sightings."""
+    """Poses (c, 3, 3), (c, 3): a tree from the first camera along pairs that share most sightings."""
     keys = (seen.views * (int(seen.points.max()) + 1) + seen.points).tolist()
     rows: list[dict[int, int]] = [{} for _ in cameras]
     for row, (camera, key) in enumerate(zip(seen.cameras.tolist(), keys, strict=True)):
@@ -313,7 +314,7 @@ def _relative_pose(
     rows: tuple[IntArray, IntArray],
     lengths: Lengths,
 ) -> tuple[FloatArray, FloatArray]:
-    """Pose of the second camera in the first: the essential matrix, and the scale that the wand's lengths give."""
+    """Pose of the second camera in the first: the essential matrix, scaled by the wand's lengths."""
     names = f"cameras {cameras[0].frame_id} and {cameras[1].frame_id}"
     first, second = (np.ascontiguousarray(flat[each]) for each in rows)
     width = _RANSAC[1] / float(np.mean([camera.matrix[[0, 1], [0, 1]] for camera in cameras]))
