@@ -35,7 +35,7 @@ _FILTERS: Final = {
 FILTERS: Final = tuple(_FILTERS)
 """The names that :func:`make_filter` knows."""
 THESIS_FILTERS: Final = ("thesis_lkf1", "thesis_lkf2", "schlagenhauf_ekf")
-"""The published methods, which get their measurements as they are."""
+"""The published methods, which get uncorrected measurements."""
 
 
 class SkeletonFilter(Protocol):
@@ -66,7 +66,7 @@ class ModelFilter(SkeletonFilter, Protocol):
         """Take the orientation of one segment; whether there is an estimate at its time."""
 
     def settle(self, until_ns: int) -> None:
-        """Do deferred work when no measurement from before a time will come; results do not change."""
+        """Do deferred work while idle, if no measurement from before ``until_ns`` will come; results do not change."""
 
     @property
     def filtered(self) -> Skeleton | None:
@@ -98,7 +98,7 @@ def _row(name: str) -> tuple[str, str, str]:
 
 
 def prepare(name: str) -> None:
-    """Compile the loops of a filter, or load what is kept of them, which else happens at its first frames."""
+    """Compile the loops of a filter, or load them from the cache, before its first frames need them."""
     if _row(name)[2] == "ekf.":
         _load("ekf.filter:prepare")()
 

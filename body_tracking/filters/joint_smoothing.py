@@ -21,13 +21,13 @@ class JointFrame:
     Attributes:
         skeleton: as published without smoothing.
         state: (25, n, 1) of each joint.
-        covariance: (25, n, n) of these, without the slow part of the noise.
-        slow: (25, 3, 3) that part.
+        covariance: (25, n, n) of these, without slow errors.
+        slow: (25, 3, 3) square metres: covariance of slow errors and of the last jump.
         alive: (25,) joints with an estimate.
         continued: (25,) those that were not started by this frame.
         transition: (25, n, n) from the frame before.
         prior: (25, n, 1) predicted state.
-        prior_covariance: (25, n, n) of these, with the process noise that was used in the end.
+        prior_covariance: (25, n, n) of the predicted state, with the adapted process noise.
     """
 
     skeleton: Skeleton
@@ -51,7 +51,7 @@ class JointFrame:
         transition: FloatArray,
         prior: tuple[FloatArray, FloatArray],
     ) -> Self:
-        """Of copies; posterior and prior are state and covariance, and one transition may serve all joints."""
+        """A frame of copies; posterior and prior are (state, covariance), the transition is (n, n) or (25, n, n)."""
         x, p, x_prior, p_prior = map(np.array, (*posterior, *prior))
         return cls(
             skeleton, x, p, slow, alive.copy(), continued, np.broadcast_to(transition, p.shape), x_prior, p_prior
@@ -64,7 +64,7 @@ class JointFrame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointLink:
-    """Backward gains (25, n, n), and the predictions (25, n, 1) and (25, n, n) of the next frame."""
+    """Backward gains (25, n, n), and predicted state (25, n, 1) and covariance (25, n, n) of the next frame."""
 
     gain: FloatArray
     prior: FloatArray

@@ -299,7 +299,7 @@ class LinearKalmanFilter(JointSmoother):
         if started.any():
             self._start(started, positions, noise)
             self.counters["reacquired"] += int((started & rejected).sum())
-        # after a jump either place may be wrong; the more frames confirm the new one, the less the old one counts
+        # after a jump either position may be wrong; the more frames confirm the new one, the less the old one counts
         self._jumped *= np.exp(-step / max(self.parameters.reacquire_after, 1e-3))
         jumped = sudden | started & rejected
         if jumped.any():
@@ -499,7 +499,7 @@ class LinearKalmanFilter(JointSmoother):
         return self._slow + self._jumped[:, :, None] * self._jumped[:, None, :]
 
     def last_frame(self, filtered: Skeleton) -> JointFrame:
-        """The estimate after the last frame that gave one, by the skeleton of it (``filters.smoothing``)."""
+        """The estimate after the last frame, with its filtered skeleton, for ``filters.smoothing``."""
         kalman, alive, continued = self._kalman, self._alive, self._alive & ~self._started
         posterior, prior = (kalman.x, kalman.P), (kalman.x_prior, self._prior_covariance)
         return JointFrame.of(filtered, posterior, self._systematic(), alive, continued, self._transition, prior)

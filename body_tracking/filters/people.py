@@ -126,7 +126,7 @@ class PeopleFilter:
         for person in self._persons:
             person.poll(now_ns)
         newest_ns = max(person.newest_ns for person in self._persons)
-        for person in self._persons:  # one who is not seen now must not come after the others
+        for person in self._persons:  # release held frames of people who are not seen now with the others' frames
             person.passed(newest_ns)
         self._flush()
 
@@ -160,7 +160,7 @@ class PeopleFilter:
         self._filtered.append(skeleton)
 
     def flush(self) -> None:
-        """Publish all that is held back."""
+        """Publish all frames that are held back."""
         for person in self._persons:
             person.flush()
         self._flush()

@@ -64,7 +64,7 @@ class FilterSettings:
         lag: seconds by which frames are held back to be smoothed; 0 for none.
         kinect_v2: whether the skeletons are of a Kinect v2, whose arms and spine have known errors; the thesis's
             filters do not use it.
-        not_kinects: sensors to which this does not apply. With fused frames it then applies if there are others.
+        not_kinects: sensors to which this does not apply. Fused frames are corrected unless all sensors are of these.
     """
 
     filter_name: str = DEFAULT_FILTER
@@ -89,8 +89,8 @@ class PersonFilter:
         settings: of the filter.
         publish: called with topic, payload and capture time.
         wanted: whether a topic has a subscriber; None: all topics are published.
-        one_of_several: called with the filtered skeletons instead of ``publish``, for one of several people; all frames
-            are of this person then, and topics have the person's name.
+        one_of_several: called with the filtered skeletons instead of ``publish``, for one of several people. Then all
+            frames are of this person, whose name is in the topics.
 
     Attributes:
         by_sensor: whether it takes sensors' frames instead of fused ones.
@@ -302,17 +302,17 @@ class PersonFilter:
         return 0 if self._lag is None else self._lag.newest_ns
 
     def passed(self, newest_ns: int) -> None:
-        """Publish what a frame of this stamp, of anyone, is later than by the lag."""
+        """Publish the held frames that are older by the lag than this stamp, of anyone's newest frame."""
         if self._lag is not None:
             self._release(self._lag.passed(newest_ns))
 
     def flush(self) -> None:
-        """Publish all that is held back."""
+        """Publish all frames that are held back."""
         if self._lag is not None:
             self._release(self._lag.flush())
 
     def _hold_back(self, lag: FixedLag, filtered: Skeleton | None, now_ns: int) -> None:
-        """Hold the last frame back, and publish those before it that have been for long enough."""
+        """Hold the last frame back, and publish the earlier ones that have been held for the lag."""
         assert isinstance(self._filter, SmoothableFilter)
         self._release(lag.take(self._filter.last_frame(filtered), now_ns))
 
@@ -326,7 +326,7 @@ class PersonFilter:
                 self._send(skeleton, estimate)
 
     def reset(self) -> None:
-        """Publish what is held back, and forget the person, after a jump of time; poses and clocks stay."""
+        """Publish the held frames, and forget the person, after a jump of time; poses and clocks stay."""
         self.flush()
         self._filter.reset()
         self._ordering.flush()

@@ -3,9 +3,8 @@
 As published: the state is 26 angles and 26 rates (eq. 5.13), the model one of constant angular velocity with a fixed
 time step (eq. 5.16), process and measurement noise are constant, the subject starts in the T-pose, which is theta = 0,
 and the base of the spine stands still where it was then. Segment lengths come from the calibration in the T-pose; a
-missing joint has neither innovation nor gain (eq. 5.21-5.22). The one thing corrected in the filter is line 8: the
-innovation is ``z - h(s)``, not ``z - H s``. (Her errors in calibration and weights are
-corrected in ``calibration`` and ``fusion``.)
+missing joint has neither innovation nor gain (eq. 5.21-5.22). Only line 8 of the filter is corrected: the innovation is
+``z - h(s)``, not ``z - H s``. (Her errors in calibration and weights are corrected in ``calibration`` and ``fusion``.)
 
 Its weaknesses are kept: of 26 directions in the space of angles six are never observed, eight not in the T-pose, and
 the angles drift along them; there is no gate; time without a frame is not predicted. Its covariances are too small, and

@@ -1,6 +1,6 @@
 """Fixed-lag smoothing: a backward pass over the last frames (Rauch, Tung and Striebel 1965).
 
-A frame is published when one that is later by the lag or more has been filtered, with what the later ones say of it.
+A frame is published, corrected by the later ones, when a frame later by at least the lag has been filtered.
 With the smoothed estimate of the next frame ``x_s``, ``P_s`` and the prediction of that frame ``x-``, ``P-``:
 
     G = P F^T (P-)^-1,    x + G (x_s - x-),    P + G (P_s - P-) G^T                                          (1)
@@ -18,7 +18,7 @@ from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Skeleton
 MAX_LAG = 0.3
 """Seconds; greatest lag of a live graph."""
 WHOLE_LAG = 2.0
-"""Seconds; the lag with which a replay smooths a whole recording: what comes later says nothing any more."""
+"""Seconds; the lag with which a replay smooths a whole recording: later frames add no information."""
 _SILENCE = 0.1
 """Seconds without a frame from which on the sensors are silent."""
 
@@ -35,13 +35,13 @@ class SmoothableFilter(Protocol):
     """A filter whose estimates can be smoothed. Frames are its own, and immutable."""
 
     def last_frame(self, filtered: Skeleton | None) -> Any:
-        """The estimate after the last frame, by what ``update`` made of it; filters on a model take None."""
+        """The estimate after the last frame, with the output of ``update``; filters on a model take None."""
 
     def link(self, before: Any, after: Any) -> Any:
-        """The backward gains between two successive frames and the prediction; None for no relation."""
+        """The backward gains between two successive frames and the prediction; None if the pose is not continuous."""
 
     def smoothed(self, frame: Any, link: Any, later: Any) -> Any:
-        """The frame with what the next one, smoothed, says of it."""
+        """The frame smoothed by the next one, which is smoothed already."""
 
     def results_of(self, frame: Any) -> tuple[Skeleton, ModelEstimate | None]:
         """The skeleton and the state as the filter publishes them; None without a model."""
@@ -57,7 +57,7 @@ def backward_gain(cross: FloatArray, prediction: FloatArray) -> FloatArray:
 
 
 def smoothed_covariance(own: FloatArray, gain: FloatArray, later: FloatArray, prediction: FloatArray) -> FloatArray:
-    """(..., n, n) of eq. 1, by four of them."""
+    """(..., n, n) smoothed covariance of eq. 1; all arguments are (..., n, n)."""
     result: FloatArray = own + gain @ (later - prediction) @ gain.swapaxes(-1, -2)
     return result
 
@@ -71,8 +71,8 @@ class FixedLag:
             instead of once for every later frame.
 
     Attributes:
-        due_ns: time at which the sensors count as silent and all is to be released, in the clock of :meth:`take`; None
-            while nothing is held.
+        due_ns: time at which the sensors count as silent and all frames are released, in the clock of :meth:`take`;
+            None while no frame is held.
     """
 
     def __init__(self, smoother: SmoothableFilter, lag: float) -> None:
@@ -90,7 +90,7 @@ class FixedLag:
         return self._held[-1].stamp_ns if self._held else 0
 
     def take(self, frame: Frame, now_ns: int) -> list[Any]:
-        """Hold a frame; the smoothed ones that are to be published, all of them where time jumped back."""
+        """Hold a frame; returns the smoothed frames to publish, all that are held if time jumped back."""
         released = []
         if self._held:
             if frame.stamp_ns <= self._held[-1].stamp_ns:
@@ -102,17 +102,17 @@ class FixedLag:
         return released + self.passed(frame.stamp_ns)
 
     def passed(self, newest_ns: int) -> list[Any]:
-        """The smoothed frames that are to be published when there is a frame of this stamp."""
+        """The smoothed frames to publish once there is a frame of this stamp."""
         if not self._held or newest_ns - self._held[0].stamp_ns < self._hold_ns:
             return []
         return self._released(sum(frame.stamp_ns <= newest_ns - self._lag_ns for frame in self._held))
 
     def flush(self) -> list[Any]:
-        """All frames, smoothed."""
+        """All held frames, smoothed."""
         return self._released(len(self._held))
 
     def _released(self, count: int) -> list[Any]:
-        """The backward pass over all frames; the first ones are held no longer."""
+        """Smooth all held frames by the backward pass, and release the first ``count``."""
         if not count:
             return []
         smoothed = self._held[-1:]

@@ -32,8 +32,8 @@ class StackedKalmanFilter:
 
         Args:
             F: (size, size) or (n, size, size) transition.
-            Q: the same, covariance of the process noise.
-            control: (n, size, 1) what is added to the states.
+            Q: (size, size) or (n, size, size) covariance of the process noise.
+            control: (n, size, 1) added to the states.
         """
         x = F @ self.x
         self.x = x if control is None else x + control

@@ -33,8 +33,8 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
         return
     imus = options["imus"]
     worn = graph.imu_topics(imus if isinstance(imus, tuple) else ())
-    # Those of the arms are in the mesh of a depth camera already, and count twice; but no mesh shows how an arm is
-    # turned about itself, and beside other sensors that is worth more (docs/five_systems.md).
+    # The mesh of a depth camera has used the arms' inertial sensors already, so that they would count twice. But no
+    # mesh shows the axial rotation of an arm, which matters more when there are other sensors (docs/five_systems.md).
     depth, sensors = options["depth"], options["sensors"]
     meshes_alone = isinstance(depth, tuple) and isinstance(sensors, tuple) and len(depth) == len(sensors) > 0
     segments = tuple(each.segment for each in worn if not (meshes_alone and each.segment in graph.ARM_SEGMENTS))
