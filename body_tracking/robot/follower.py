@@ -8,8 +8,8 @@ States and transitions (times from the mapping's ``SafetyLimits``)::
        └───────────a fault after stop_after of holding───────────── holding
 
 - *stopped*: no commands. The initial state; without a ``state_topic`` an operator has to enable the robot.
-- *approaching*: follows from where the robot stands; the rates grow from 0 to their limits, so that it does not jump.
-- *following*: each command is the person's predicted posture of now, within the limits.
+- *approaching*: follows, starting at the robot's position; the rates grow from 0 to their limits: no jump.
+- *following*: each command is the person's posture, predicted to now, within the limits.
 - *holding*: repeats the last command, after joints with a limit of acceleration have braked. Where the robot did not
   follow its command, the command is the robot's measured position.
 
@@ -241,7 +241,7 @@ class Follower:
             self._sensors[sensor] = stamp_ns, steady_ns
 
     def watch_sensors(self, sensors: tuple[str, ...]) -> None:
-        """Hold while none of these sensors sends frames; with no sensors given, never for that reason."""
+        """Hold while none of these sensors sends frames; an empty tuple turns this off."""
         self._watched = sensors
 
     def report_publishers(self, problem: str) -> None:
@@ -373,7 +373,7 @@ class Follower:
         return self._check_tracking(steady_ns)
 
     def _fault(self, steady_ns: int, elapsed: float, prediction: _Prediction) -> str:
-        """A fault of now or before the next command; empty for none."""
+        """A fault that exists now or would before the next command; empty for none."""
         limits, angles, age = self._limits, self._angles, prediction.age
         allowed_ns = round((limits.silence - self._period) * NANOSECONDS)
         if not self.enabled:

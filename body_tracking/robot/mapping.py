@@ -105,7 +105,7 @@ class SafetyLimits:
         float("inf"),
     )
     max_tracking_error: float = number_field(
-        # an arm that follows 0.2 s late at 1.5 rad/s; and what it jumps by at most when it is let go
+        # the error of an arm that lags by 0.2 s at 1.5 rad/s; also the greatest jump of an arm that is released
         0.3,
         "hold where a joint of the robot stands further than this from its command (with state_topic); while it "
         "approaches, less, in proportion to the rate, from a quarter of it on",
@@ -154,7 +154,7 @@ class RobotMapping:
         rate: (n,) rad/s.
         acceleration: (n,) rad/s^2; infinite where not limited.
         max_stddev: (n,) radians, for each of a joint's angles.
-        alone: (n,) whether only this joint holds while its angles are unknown, and the others go on.
+        alone: (n,) whether only this joint holds while its angles are unknown, and the others continue.
     """
 
     robot: str
