@@ -108,7 +108,7 @@ def _compressed(data: bytes, stamp_ns: int, frame_id: str, form: str, wire: Wire
 
 
 def _decoded(data: memoryview, flags: int, form: str) -> NDArray[Any]:
-    """The pixels of a JPEG or PNG image; MessageError where it is none, or of a hostile size."""
+    """The pixels of a JPEG or PNG image; MessageError for other data, a damaged image or a hostile size."""
     size = _size_of(bytes(data))
     if size is None:
         raise MessageError(f"{len(data)} bytes of format {form!r} are no JPEG or PNG image")
@@ -124,7 +124,7 @@ def _decoded(data: memoryview, flags: int, form: str) -> NDArray[Any]:
 
 
 def _size_of(data: bytes) -> int | None:
-    """Pixels that the head of an image states, before memory is taken for them; None where it has no such head."""
+    """Number of pixels by the header of an image, before memory is allocated; None without such a header."""
     if data.startswith(b"\x89PNG\r\n\x1a\n") and len(data) >= 24:
         width, height = struct.unpack(">II", data[16:24])
         return int(width) * int(height)

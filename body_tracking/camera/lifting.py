@@ -1,8 +1,8 @@
-"""From landmarks in a colour image and the depth image behind them to the joints of a body in three dimensions.
+"""Joints of a body in three dimensions, from landmarks in a colour image and the depth image at the same pixels.
 
-A depth camera measures the skin or the clothes; the centre of a joint lies behind that along the line of sight. Where
-something else hides a joint, the depth at its pixel is that of what is in front: it contradicts the depth which the
-statistical model of the landmarks expects there, and the joint is then inferred from this expectation.
+A depth camera measures the skin or the clothes; the centre of a joint lies behind the surface along the line of sight.
+Where an object hides a joint, the depth at its pixel is the object's. This contradicts the depth expected by the
+statistical model of the landmarks, and the joint is inferred from the expected depth.
 """
 
 from __future__ import annotations
@@ -21,40 +21,40 @@ from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray, Joint, 
 from body_tracking.mesh.depth import axial_noise
 
 BODY_SIDE: Final = 2.2
-"""Metres: side of the region around an upright person, which the landmarks' errors are proportional to."""
+"""Metres: side of the region around an upright person; the landmarks' errors are proportional to it."""
 ACROSS: Final = 0.04
 """Metres: standard deviation of a landmark across the line of sight, per axis, in a region of :data:`BODY_SIDE`. With
-what landmarks are displaced by (below), 43 mm: so many landmarks of photographs are then within a fifth of the torso's
-diagonal as published of the network (PCK@0.2 of 95.8 %: Google, MediaPipe Pose, "Pose estimation quality"). In rendered
+the landmarks' displacements (below) it is 43 mm, which reproduces the published share of landmarks within a fifth of
+the torso's diagonal in photographs (PCK@0.2 of 95.8 %: Google, MediaPipe Pose, "Pose estimation quality"). In rendered
 images it is 16 mm."""
 HIDDEN: Final = 3.0
-"""Factor on it for a landmark that the network guesses."""
+"""Factor on :data:`ACROSS` for a landmark that the network guesses."""
 _ALONG: Final = 0.02
 """Metres: standard deviation of the depth of a joint's centre behind the surface: people and clothes differ."""
 _GUESSED_ALONG: Final = 0.25
-"""The same where the depth is only expected."""
+"""Metres: the same where the depth is the expected one."""
 _DISAGREED: Final = 0.5
-"""Share of the difference between the depths measured and expected that is added to it: where the limb is behind the
-trunk, as of somebody seen from the side, the two differ."""
+"""Share of the difference between measured and expected depth that is a standard deviation, too: they differ where the
+limb is behind the trunk, as of a person seen from the side."""
 _TURNED: Final = (0.08, 0.16)
-"""Metres by which one shoulder or hip is farther away than the other, as the statistical model says, between which the
-farther one goes from seen to hidden behind the trunk: what is measured there is chest or belly."""
+"""Metres: difference in depth of the two shoulders or hips, by the statistical model, from which on the trunk begins to
+hide the farther one, and at which it hides it. The depth measured there is that of chest or belly."""
 _BETWEEN: Final = 0.045
-"""Metres: standard deviation of this difference, of simulated people from all sides."""
+"""Metres: standard deviation of this difference, for simulated people seen from all sides."""
 _WINDOW: Final = 0.06
-"""Metres to each side of a landmark in which its surface is looked for: 1.5 deviations of the landmark."""
+"""Metres to each side of a landmark in which its surface is searched: 1.5 standard deviations of the landmark."""
 _EXPECTED: Final = 0.25
-"""Metres by which a joint's surface may be off the depth that is expected."""
+"""Metres: greatest difference of a joint's surface from its expected depth."""
 _LEAST_PIXELS: Final = 4
 SEEN: Final = 0.5
 """Least probability that a landmark is visible, or in the image."""
 _FLAT_POINTS: Final = 200
 _FLAT: Final = 0.005
-"""Metres: a body whose surface is off a plane by less than this and the camera's noise, RMS, is a picture of one; the
-flattest of simulated people, who stand straight before the camera, are off by 10 mm."""
+"""Metres: a body whose surface deviates from a plane by less than this plus the camera's noise, RMS, is a picture; the
+flattest simulated people, who stand straight before the camera, deviate by 10 mm."""
 
-# The landmarks whose mean each joint is; how far its centre is behind the surface, metres: half of the segment's depth
-# there, of adults in clothes; and by how many metres per axis what the landmark marks is displaced from the joint.
+# For each joint: the landmarks of which it is the mean; the distance of its centre behind the surface, metres, half the
+# depth of the segment there in clothed adults; the displacement of the landmark from the joint, metres per axis.
 _MADE_OF: Final[dict[Joint, tuple[tuple[Landmark, ...], float, float]]] = {
     Joint.HEAD: ((Landmark.EAR_LEFT, Landmark.EAR_RIGHT), 0.09, 0.035),
     **{
@@ -79,8 +79,8 @@ for _row, (_names, _, _) in enumerate(_MADE_OF.values()):
 _BEHIND: FloatArray = np.array([behind for _, behind, _ in _MADE_OF.values()])
 _DISPLACED: FloatArray = np.array([displaced for _, _, displaced in _MADE_OF.values()])
 
-# Joints of the trunk that no landmark is at, as weights of the middles of the shoulders and of the hips, and by how
-# many metres per axis they are displaced. A Kinect's SpineMid divides the line between them so, in real people.
+# Joints of the trunk without a landmark: weights of the middles of shoulders and hips, and displacement, metres per
+# axis. A Kinect's SpineMid divides the line between the middles in this ratio in real people.
 _TRUNK: Final[dict[Joint, tuple[float, float, float]]] = {
     Joint.SPINE_BASE: (0.0, 1.0, 0.02),
     Joint.SPINE_MID: (0.578, 0.422, 0.05),
@@ -94,7 +94,7 @@ _TORSO: IntArray = np.array(
     [Landmark.SHOULDER_LEFT, Landmark.SHOULDER_RIGHT, Landmark.HIP_RIGHT, Landmark.HIP_LEFT], dtype=np.intp
 )
 _SPINE: Final = 0.08
-"""Metres: width of what is taken for the trunk in any case."""
+"""Metres: width about the spine that always belongs to the trunk."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,7 +140,7 @@ def lift(found: Landmarks, depth: SingleArray, camera: Camera) -> Lifted | None:
     surface, spread = _surfaces(
         depth, pixels, expected, _EXPECTED, _WINDOW * focal / np.where(wanted, expected, 1.0), wanted
     )
-    # where the network guesses, what is measured may be in front of the joint
+    # where the network guesses, the measured surface may be in front of the joint
     seen = np.isfinite(surface) & (visible > SEEN)
     rays = np.concatenate([camera.undistort(pixels), np.ones((len(pixels), 1))], axis=1)
     depths, hidden = _behind_the_trunk(np.where(seen, surface, expected), world[:, 2], seen)
@@ -163,7 +163,7 @@ def _behind_the_trunk(depths: FloatArray, relative: FloatArray, seen: BoolArray)
 
     Args:
         depths: (n,) metres, of the surface at each joint.
-        relative: (n,) metres, depth of each joint against the body as the statistical model of the landmarks has it.
+        relative: (n,) metres, depth of each joint relative to the body, by the statistical model of the landmarks.
         seen: (n,) joints whose depth is measured.
 
     Returns:
@@ -191,7 +191,7 @@ def joints_of(points: FloatArray, covariances: FloatArray, sure: BoolArray) -> L
     used = _WEIGHTS > 0.0
     known = np.array([bool(np.isfinite(points[row]).all()) for row in used])
     places = _WEIGHTS @ np.where(np.isfinite(points), points, 0.0)
-    # the errors of the landmarks of one joint are alike
+    # the errors of a joint's landmarks are correlated: averaging does not reduce them
     spread = np.einsum("jl,lab->jab", _WEIGHTS, np.where(np.isfinite(covariances), covariances, 0.0))
     spread += (_DISPLACED**2)[:, None, None] * np.eye(3)
     seen = np.array([bool(sure[row].all()) for row in used])
@@ -224,9 +224,9 @@ def is_flat(found: Landmarks, depth: SingleArray, camera: Camera) -> bool:
 
 
 def _trunk_mask(found: Landmarks, shape: tuple[int, ...]) -> BoolArray:
-    """Pixels of the trunk: between shoulders and hips, and about the spine where it is seen from the side.
+    """(height, width) pixels of the trunk: between shoulders and hips, and about the spine for a view from the side.
 
-    None where a corner is unknown.
+    No pixel if a corner is unknown.
     """
     corners = found.pixels[_TORSO]
     mask = np.zeros(shape, np.uint8)
@@ -282,7 +282,7 @@ def prepare() -> None:
 
 
 def _whole(positions: FloatArray, covariances: FloatArray, seen: BoolArray, known: BoolArray) -> Lifted:
-    """All joints of the set from those that have landmarks."""
+    """All 25 joints from those with landmarks."""
     points, spread = np.full((len(Joint), 3), np.nan), np.full((len(Joint), 3, 3), np.nan)
     states = np.full(len(Joint), TrackingState.NOT_TRACKED, np.uint8)
     made = _JOINTS[known]
@@ -294,7 +294,7 @@ def _whole(positions: FloatArray, covariances: FloatArray, seen: BoolArray, know
         if any(states[each] == TrackingState.NOT_TRACKED for _, each in used):
             continue
         points[joint] = sum(weight * points[each] for weight, each in used)
-        # the errors of the trunk's landmarks are alike
+        # the errors of the trunk's landmarks are correlated: averaging does not reduce them
         spread[joint] = np.mean([spread[each] for _, each in used], axis=0) + displaced**2 * np.eye(3)
         states[joint] = min(states[each] for _, each in used)
     return Lifted(points, states, spread)

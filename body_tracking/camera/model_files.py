@@ -1,4 +1,4 @@
-"""Where the networks lie, and how they come there."""
+"""Folder of the networks, and their download."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _DIGESTS: Final = {
 _BUILT_FOR: Final = ("--python-version", "3.12", "--platform", "manylinux_2_28_x86_64")
 """One of its wheels; the networks are the same in all of them."""
 _LARGEST: Final = 64 << 20
-"""Bytes of a file in it that is read."""
+"""Bytes: greatest size of a file in it that is read."""
 
 
 def default_folder() -> Path:

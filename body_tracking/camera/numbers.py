@@ -1,4 +1,4 @@
-"""Numbers of the people whom several cameras see, which stay from one time to the next."""
+"""Persistent numbers of the people whom several cameras see."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _STEP: Final = 0.5
 
 
 class PersonNumbers:
-    """Gives each person the number of the nearest one of the last time.
+    """Gives each person the number of the nearest person at the last time.
 
     Args:
         most: the largest number of people.
@@ -41,7 +41,7 @@ class PersonNumbers:
             if number < 0:
                 numbers[k] = self._next
                 self._next = (self._next + 1) % (1 << 16)
-        # who is not seen for a moment keeps the number
+        # a person who is not seen for a moment keeps the number
         kept = {number: place for number, place in self._places.items() if number not in numbers}
         latest = dict(list(kept.items())[-self.most :])
         self._places = {**latest, **dict(zip(numbers, centres, strict=True))}

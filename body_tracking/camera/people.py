@@ -24,7 +24,7 @@ class PersonTracker:
         search_every: seconds between two searches for more of them.
 
     Attributes:
-        counters: of what happened.
+        counters: of searches, and of people lost or found twice.
     """
 
     def __init__(self, model: PoseModel, people: int, search_every: float) -> None:

@@ -44,7 +44,7 @@ ImageArray = NDArray[np.uint8]
 
 
 class PoseModelError(BodyTrackingError):
-    """The files of the networks are missing or are none, or an image cannot be used."""
+    """Raised when a file of the networks is missing or invalid, or the library that runs them is not installed."""
 
 
 class Landmark(IntEnum):
@@ -132,8 +132,8 @@ class Landmarks:
         pixels: (33, 2) in the image.
         visible: (33,) probability that the landmark is in the image and not hidden.
         present: (33,) probability that the landmark is in the image.
-        world: (33, 3) metres from the middle of the hips, as a statistical model of bodies has it: x right, y down, z
-            away from the camera.
+        world: (33, 3) metres from the middle of the hips, by a statistical model of bodies: x right, y down, z away
+            from the camera.
         presence: probability that there is a person in the region.
         region: in which they were found.
         next_region: in which to look in the next image.
@@ -177,14 +177,14 @@ class PoseModel:
         """
         height, width = image.shape[:2]
         scale = _DETECTOR_PIXELS / max(height, width)
-        # in the middle of a square whose rest is black
+        # centred in a black square
         shift = (_DETECTOR_PIXELS - scale * np.array([width, height])) / 2.0
         to_square = np.array([[scale, 0.0, shift[0]], [0.0, scale, shift[1]]])
         square = cv2.warpAffine(image, to_square, (_DETECTOR_PIXELS, _DETECTOR_PIXELS), flags=cv2.INTER_LINEAR)
         boxes, scores = self._detector(square.astype(np.float32) / np.float32(127.5) - np.float32(1.0))
         probable = _sigmoid(scores[0, :, 0].astype(np.float64))
         chosen = np.flatnonzero(probable > least)
-        # the points that the detector states, after the four numbers of the box; of these the first two: centre and rim
+        # after the four numbers of the box come the detector's points, of which the first two are centre and rim
         points = boxes[0, chosen, 4:8].astype(np.float64).reshape(-1, 2, 2) / _DETECTOR_PIXELS
         points = ((points + self._anchors[chosen, None]) * _DETECTOR_PIXELS - shift) / scale
         regions: list[Region] = []

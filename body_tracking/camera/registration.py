@@ -40,7 +40,7 @@ class Registration:
         self._view = DepthCamera(depth)
         scale = np.diag([depth.width / colour.width, depth.width / colour.width, 1.0])
         matrix = scale @ colour.matrix
-        # pixels count from the centre of the first one
+        # the origin of pixel coordinates is the centre of the first pixel
         matrix[:2, 2] += (scale[0, 0] - 1.0) / 2.0
         height = max(1, round(colour.height * scale[0, 0]))
         self.camera = Camera(colour.frame_id, depth.width, height, matrix, colour.distortion, colour.model)
@@ -63,7 +63,7 @@ class Registration:
 @compiled
 def _splat(pixels: FloatArray, distances: FloatArray, height: int, width: int) -> SingleArray:
     """(height, width) least distance of the points around each pixel; each point covers two pixels in each direction,
-    so that what is near leaves no holes through which the background shows.
+    so that a near surface has no holes through which the background shows.
     """
     image = np.zeros((height, width), np.float32)
     for k in range(len(distances)):

@@ -127,7 +127,7 @@ class RigStage(Stage):
             tracker.reset()
 
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
-        """A camera whose images do not come, come at other times or in another size is named."""
+        """Names the cameras whose images are missing, come at other times or have another size."""
         problems = [f"{name}: {text}" for name, text in self._problems.items()]
         if self._sets.problem():
             problems.append(self._sets.problem())

@@ -152,7 +152,7 @@ class CameraStage(Stage):
         self._by_topic[topic][0].reset()
 
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
-        """A camera without calibration, with images of other sizes or other times, and pictures of people are named."""
+        """Names the cameras without calibration, with images of other sizes or times, or with pictures of people."""
         problems = [f"{name}: {camera.problem}" for name, camera in self._cameras.items() if camera.problem]
         values: dict[str, object] = {f"{name} people": camera.people for name, camera in self._cameras.items()}
         return (1 if problems else 0), "; ".join(problems), values
@@ -178,7 +178,7 @@ class ColourAndDepth:
         tolerance_ns: largest difference between the stamps of images of one time.
 
     Attributes:
-        counters: of images and what became of them.
+        counters: of images and people, by the result.
         people: number of people in the last image.
     """
 
@@ -206,7 +206,7 @@ class ColourAndDepth:
 
     @property
     def problem(self) -> str:
-        """Why there is no skeleton; empty where there is one, or where only nobody is seen."""
+        """Why there is no skeleton; empty if there is one, or if nobody is seen."""
         return self._problem or self._sets.problem()
 
     def calibrate(self, what: str, camera: Camera) -> None:
@@ -241,7 +241,7 @@ class ColourAndDepth:
         return self._outputs(self._sets.push(what, stamp_ns, (stamp_ns, pixels), now_ns))
 
     def poll(self, now_ns: int) -> Iterator[Output]:
-        """The same for images that have waited for long enough."""
+        """Process the images that have waited for long enough; outputs and errors as of :meth:`push`."""
         return self._outputs(self._sets.poll(now_ns))
 
     @property

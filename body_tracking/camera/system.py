@@ -45,7 +45,7 @@ def _topics(options: Options, camera: str) -> CameraTopics:
 
 
 def _rig(options: Options) -> tuple[str, ...]:
-    """The sensor of the cameras of a rig, where there is one."""
+    """The sensor of a rig's triangulated skeletons; empty without a rig."""
     return (RIG_SENSOR,) if options["camera_rig"] else ()
 
 
@@ -67,7 +67,7 @@ def _finds(topics: Mapping[str, str]) -> dict[str, Value]:
 
 
 def _finds_compressed(topics: Mapping[str, str]) -> dict[str, Value]:
-    """As :func:`_finds`, those whose colour images come compressed alone, as in a recording."""
+    """As :func:`_finds`, for cameras with only compressed colour images, as in a recording."""
     plain = {
         topic.removesuffix(COMPRESSED): IMAGE if kind == COMPRESSED_IMAGE else kind for topic, kind in topics.items()
     }
@@ -76,7 +76,7 @@ def _finds_compressed(topics: Mapping[str, str]) -> dict[str, Value]:
 
 
 def _pictures(options: Options) -> dict[str, Value]:
-    """For the page."""
+    """Defaults for the pictures on the viewer's page."""
     return {"picture_rate": 5.0} if options["viewer"] else {}
 
 

@@ -1,7 +1,7 @@
 """Joints from the landmarks that two or more calibrated colour cameras see at one time.
 
-Each landmark is the point nearest to its lines of sight, weighted by how far a pixel's error reaches at its distance.
-People are matched between cameras by how near the lines of sight of their landmarks pass each other.
+Each landmark is the point nearest to its lines of sight, weighted by the error of a pixel at its distance. People are
+matched between cameras by the distances between the lines of sight of their landmarks.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from body_tracking.core.skeleton import FloatArray
 from body_tracking.markers.rig import Rig
 
 _SAME_PERSON: Final = 0.15
-"""Metres by which the lines of sight of a person's trunk may pass each other, root mean square."""
+"""Metres: greatest distance between the lines of sight of a person's trunk, root mean square."""
 _TRUNK: Final = [Landmark.SHOULDER_LEFT, Landmark.SHOULDER_RIGHT, Landmark.HIP_LEFT, Landmark.HIP_RIGHT]
 _ROUNDS: Final = 3
 """Solutions of the normal equations, each weighted by the distances of the last one."""
 ALIKE: Final = 0.018
 """Metres per axis by which the network displaces a landmark in the same way in the images of all cameras."""
 _TRUNK_LENGTH: Final = (0.3, 0.7)
-"""Metres from the shoulders to the hips, of children and of tall adults: where lines of sight of two people meet, the
-person whom they would make is too small or too large."""
+"""Metres from the shoulders to the hips, of children and of tall adults: where the lines of sight of two different
+people meet, the resulting person is too small or too large."""
 _USUAL_LENGTH: Final = 0.5
 _FARTHEST: Final = 4.0
 """Standard deviations by which a line of sight may pass the point of the others, with three or more cameras."""
@@ -94,8 +94,8 @@ def match(rig: Rig, people: Sequence[Mapping[int, Landmarks]]) -> list[list[View
 def triangulate(rig: Rig, views: Sequence[View]) -> Lifted:
     """The joints of a person whom two or more cameras see, in the rig's frame.
 
-    The covariance is that of the landmarks' errors alone: that of the rig's calibration is not in it. The errors of
-    landmarks were chosen on simulated people whom the benchmark does not judge (``lifting.ACROSS``).
+    The covariance includes the landmarks' errors, not those of the rig's calibration. The errors of landmarks were
+    chosen on simulated people who are not in the benchmark (``lifting.ACROSS``).
     """
     lines = [lines_of(rig, view) for view in views]
     count = len(Landmark)
@@ -119,7 +119,7 @@ def triangulate(rig: Rig, views: Sequence[View]) -> Lifted:
 
 
 def _nearest(lines: Sequence[Lines], landmark: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The point nearest to lines of sight, its covariance, and by how many deviations each line passes it."""
+    """The point nearest to lines of sight, its covariance, and the distance of each line in standard deviations."""
     origins = np.array([each.origin for each in lines])
     directions = np.array([each.directions[landmark] for each in lines])
     angles = np.array([each.angles[landmark] for each in lines])
@@ -137,10 +137,10 @@ def _nearest(lines: Sequence[Lines], landmark: int) -> tuple[FloatArray, FloatAr
 
 
 def _unlike(one: Lines, other: Lines) -> float:
-    """How far two views are from those of one person, metres; infinity where they cannot be.
+    """Dissimilarity of two views in metres; infinity if they cannot be of one person.
 
-    That is by how much the lines of sight of the trunk pass each other, and how far the trunk that they make is from
-    the usual length: two people of one height have lines of sight that meet, but not at their distances.
+    It combines the distance between the lines of sight of the trunk and the difference of the triangulated trunk from
+    the usual length: the lines of sight of two people of one height meet, but not at the distances of the people.
     """
     apart = _apart(one, other)
     if not apart < _SAME_PERSON:
@@ -152,7 +152,7 @@ def _unlike(one: Lines, other: Lines) -> float:
 
 
 def _apart(one: Lines, other: Lines) -> float:
-    """Metres by which the lines of sight of two views' trunks pass each other, root mean square; infinity without."""
+    """Metres between the lines of sight of two views' trunks, root mean square; infinity if a landmark is missing."""
     cross = np.cross(one.directions[_TRUNK], other.directions[_TRUNK])
     length = np.linalg.norm(cross, axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
