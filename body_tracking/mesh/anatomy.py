@@ -1,8 +1,8 @@
-"""Anatomical frames of the segments of a body model, and its angles and their ranges.
+"""Anatomical frames of the segments of a body model, joint angles and their ranges.
 
 Every segment has a frame as in :mod:`body_tracking.kinematics.upper_body`: in the neutral-zero pose (upright, arms
-hanging, thumbs forward) x is forward, y left and z up. A body model's rest pose is another one, a T or an A; the
-frames at rest are columns in the model's axes (SMPL's: x left, y up, z forward).
+hanging, thumbs forward) x is forward, y left and z up. A body model's rest pose differs (a T or an A pose); ``frames``
+at rest are columns in the model's axes (SMPL's: x left, y up, z forward).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ SIDES: Final = ("left", "right")
 UPRIGHT: Final[FloatArray] = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 """Frame of an upright trunk: forward, left and up as columns in a model's axes."""
 _STRAIGHT = np.radians(10.0)
-"""An elbow at rest that bends less than this does not show its axis."""
+"""Radians: an elbow at rest that bends less does not show its axis."""
 
 
 def segment_frames(
@@ -30,10 +30,10 @@ def segment_frames(
     """Frames (J, 3, 3) of the segments at rest, as columns in the model's axes.
 
     Args:
-        names: of the joints, SMPL's; a joint that is not known gets the frame of the trunk.
+        names: of the joints, SMPL's; an unknown joint gets the frame of the trunk.
         joints: (J, 3) at rest.
-        thumbs: per side, the direction (3,) from the little finger's to the index finger's knuckle at rest; forward
-            where it is not given, as in SMPL's T-pose with palms down.
+        thumbs: per side, the direction (3,) from the little finger's to the index finger's knuckle at rest; None for
+            forward, as in SMPL's T-pose with palms down.
     """
     place = {name: joints[number] for number, name in enumerate(names)}
     frames = np.tile(UPRIGHT, (len(names), 1, 1))
@@ -63,18 +63,17 @@ def _frame(up: FloatArray, forward: FloatArray) -> FloatArray:
     return np.column_stack([np.cross(y, z), y, z])
 
 
-# Degrees about (y, x, z) of the frame, in this order: flexion, bend to the right, turn to the left. Lower bounds, upper
-# bounds, mean and standard deviation of ordinary postures. The bounds of joints that ranges.py has are its; the spine's
+# Degrees about (y, x, z) of the frame, in this order: flexion, bend to the right, turn to the left. Lower and upper
+# bounds, mean and standard deviation of ordinary postures. Bounds come from ranges.py where it has them; the spine's
 # are shared between the model's joints, lumbar: spine1 and spine2, thoracic: spine3, the neck's between neck and head.
-# Mean and deviation only matter where nothing is seen: clinical zero, and a third of the range, less where a joint of
-# the model turns about an axis that the anatomical one does not have.
+# Mean and deviation only matter for hidden joints: clinical zero (else _POSTURE) and a sixth of the range's width.
 def _of(kind: str, share: float = 1.0, sign: float = 1.0) -> tuple[float, float]:
     low, high = (share * bound for bound in RANGES[kind])
     return (low, high) if sign > 0.0 else (-high, -low)
 
 
 _NONE = (-5.0, 5.0)
-"""An axis about which the joint does not turn: what the model's axes are off by."""
+"""Degrees: bounds of an axis without anatomical motion; allows for misalignment of the model's axes."""
 
 
 def _bounds(name: str) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float]]:
@@ -99,18 +98,18 @@ def _bounds(name: str) -> tuple[tuple[float, float], tuple[float, float], tuple[
         return (-5.0, 140.0), _NONE, _NONE
     if joint == "ankle":
         return (-30.0, 50.0), (-20.0, 20.0), (-20.0, 20.0)
-    return (-1.0, 1.0), (-1.0, 1.0), (-1.0, 1.0)  # fingers, toes, jaw and eyes of SMPL's files stay as they are
+    return (-1.0, 1.0), (-1.0, 1.0), (-1.0, 1.0)  # fingers, toes, jaw and eyes of SMPL's files stay fixed
 
 
 _POSTURE: Final = {"elbow": (-30.0, 45.0), "hip": (-10.0, 30.0), "knee": (15.0, 30.0)}
-"""Degrees: mean and deviation of the flexion of joints that do not hang straight in ordinary postures."""
+"""Degrees: mean and deviation of the flexion of joints that are bent in ordinary postures."""
 _TO_CENTRE: Final = {
     side: so3.quat_to_matrix(
         so3.quat_inverse(so3.exp(0.5 * np.pi * np.cross([0.0, 0.0, -1.0], [np.sqrt(0.5), sign * np.sqrt(0.5), 0.0])))
     )
     for side, sign in (("left", 1.0), ("right", -1.0))
 }
-"""To the centre of a shoulder's reach, as in :mod:`body_tracking.kinematics.ranges`."""
+"""Rotation to the centre of a shoulder's reach, as in :mod:`body_tracking.kinematics.ranges`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,7 +119,7 @@ class Angles:
     Attributes:
         values: (J, 3) radians about (y, x, z) of the segment's frame, in this order; for a shoulder the rotation vector
             from the centre of its reach. Zero for the first joint.
-        gradients: (J, 3, 3) by a small rotation of the segment about the axes of its frame.
+        gradients: (J, 3, 3) derivative of the values by a small rotation of the segment about its frame's axes.
     """
 
     values: FloatArray
@@ -169,7 +168,7 @@ class Anatomy:
         c = np.arctan2(q[:, 1, 0], q[:, 1, 1])
         values = np.stack([np.arctan2(q[:, 0, 2], q[:, 2, 2]), b, c], axis=1)
         sin, cos = np.sin(c), np.cos(c)
-        # q = Ry(a) Rx(b) Rz(c): rates of the angles by the angular velocity in the turned frame, singular at b = 90 deg
+        # q = Ry(a) Rx(b) Rz(c): angle rates by the angular velocity in the rotated frame, singular at b = 90 deg
         secant = 1.0 / np.maximum(np.cos(b), 0.1)
         gradients = np.zeros((len(q), 3, 3))
         gradients[:, 0, 0], gradients[:, 0, 1] = sin * secant, cos * secant
@@ -186,6 +185,6 @@ class Anatomy:
         return Angles(values, gradients)
 
     def rotations(self, turned: FloatArray) -> FloatArray:
-        """(J, 3, 3) rotations relative to the parents in the model's axes, of such between the segments' frames."""
+        """(J, 3, 3) rotations relative to the parents in the model's axes, from those between the segments' frames."""
         result: FloatArray = self._parent_frames @ turned @ self._frames.mT
         return result

@@ -1,4 +1,4 @@
-"""Body-index images beside depth images: which belong together, and which body in them is the person."""
+"""Body-index images for depth images: pairing by stamp, and selection of the person's body."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from body_tracking.mesh.depth import DepthError
 NO_BODY: Final = 255
 """Pixel of a body-index image that belongs to nobody (Kinect SDK 2.0)."""
 _STRAY: Final = 0.05
-"""Share of the largest body's pixels below which others are stray pixels."""
+"""Share of the largest body's pixels, below which a body is discarded as stray pixels."""
 _NEAR: Final = 0.3
-"""Share of a body's pixels that are near the predicted mesh, from which on it may be the person: somebody who walks
-before the person is not."""
+"""Share of a body's pixels near the predicted mesh, above which it may be the person; excludes somebody who walks in
+front of the person."""
 _WAIT_NS: Final = NANOSECONDS // 20
 """Longest wait of a depth image for its body-index image."""
 _SENT_NS: Final = NANOSECONDS
-"""Difference of stamps up to which a sensor that has sent body-index images is taken to send them still."""
+"""Largest difference of stamps at which a sensor still counts as sending body-index images."""
 _MAX_MISSES: Final = 10
-"""Depth images in a row without a body-index image after which they do not wait any more."""
+"""Consecutive depth images without a body-index image, after which the wait is disabled."""
 _KEPT: Final = 64
-"""Body-index images that wait for their depth image; 14 MB of a Kinect v2."""
+"""Largest number of body-index images kept for their depth images; 14 MB for a Kinect v2."""
 
 IndexArray = NDArray[np.uint8]
 
@@ -33,18 +33,17 @@ IndexArray = NDArray[np.uint8]
 def of_body_index(
     index: IndexArray, depth: SingleArray, near: BoolArray | None = None, choice: int = 0
 ) -> tuple[BoolArray, int | None]:
-    """The person of a body-index image, and the number in it.
+    """Mask of the person in a body-index image, and the person's number there.
 
     Args:
         index: (height, width) number of the body at each pixel, 255 for none.
         depth: (height, width) metres, 0 where missing.
-        near: (height, width) pixels near the mesh where the person is expected: the body with most of them is taken,
-            whatever its number was before. None where nobody was tracked: the body with most pixels is taken.
-        choice: without ``near``, which of the bodies to take, the largest first; counted on from the first one after
-            the last.
+        near: (height, width) pixels near the predicted mesh: the body with most of them is taken, whatever its number
+            was before. None if nobody was tracked: the body with most pixels is taken.
+        choice: without ``near``, rank of the body to take, the largest first; wraps around after the last one.
 
     Returns:
-        The mask, and the number; None where nobody is seen.
+        The mask, and the number; None if nobody is visible.
 
     Raises:
         DepthError: the two images differ in size.
@@ -69,7 +68,7 @@ def _size(image: NDArray[np.generic]) -> str:
 
 
 class Pair(NamedTuple):
-    """A depth image, and the body-index image of its stamp where there is one of its size."""
+    """A depth image, and the body-index image with its stamp and size if there is one."""
 
     stamp_ns: int
     depth: SingleArray
@@ -77,13 +76,13 @@ class Pair(NamedTuple):
 
 
 class IndexPairs:
-    """Pairs the depth images of a sensor with body-index images of the same stamps, which may come before or after.
+    """Pairs the depth images of a sensor with body-index images of equal stamps, in either order of arrival.
 
-    A depth image waits only while the sensor sends body-index images and they match; else it is given at once.
+    A depth image waits only while the sensor sends matching body-index images; else it is returned at once.
 
     Args:
         topic: of the body-index images, for :attr:`problem`.
-        counters: of images and of what became of them.
+        counters: of images by outcome.
     """
 
     def __init__(self, topic: str, counters: Counter[str]) -> None:
@@ -94,14 +93,14 @@ class IndexPairs:
         self.forget_indices()
 
     def add_depth(self, stamp_ns: int, depth: SingleArray, now_ns: int) -> None:
-        """Take a depth image; ``now_ns`` is its arrival, by the clock of :meth:`next`."""
+        """Add a depth image; ``now_ns`` is its arrival, by the clock of :meth:`next`."""
         self._waiting.append((stamp_ns, depth, now_ns))
 
     def add_index(self, stamp_ns: int, index: IndexArray) -> None:
-        """Take a body-index image."""
+        """Add a body-index image."""
         self._newest_ns = stamp_ns
         if stamp_ns in self._unpaired:
-            # its depth image was not waited for, or not for long enough
+            # its depth image has been returned already
             self._counters["body-index images that came too late"] += 1
             self._misses = 0
             return
@@ -115,7 +114,7 @@ class IndexPairs:
         self._bad = f"{self._topic}: not mono8"
 
     def next(self, now_ns: int) -> Pair | None:
-        """The next depth image that need not wait any more; None for none."""
+        """The next depth image that need not wait; None if there is none."""
         if not self._waiting:
             return None
         stamp_ns, depth, since_ns = self._waiting[0]
@@ -143,22 +142,22 @@ class IndexPairs:
 
     @property
     def deadline_ns(self) -> int | None:
-        """When the next depth image has waited for long enough; None where none waits."""
+        """When the wait of the next depth image expires; None if none waits."""
         return self._waiting[0][2] + _WAIT_NS if self._waiting else None
 
     @property
     def problem(self) -> str:
-        """Why body-index images are not used; "" where they are, or where there are none."""
+        """Why body-index images are not used; "" if they are, or if there are none."""
         if not self._bad and self._misses >= _MAX_MISSES:
             return f"{self._topic}: none has the stamp of one of the last {self._misses} depth images"
         return self._bad
 
     def forget_depth(self) -> None:
-        """Forget the depth images that wait."""
+        """Drop the waiting depth images."""
         self._waiting.clear()
 
     def forget_indices(self) -> None:
-        """Forget the body-index images, as after a backward jump of their time."""
+        """Drop the body-index images, e.g. after a backward jump of their time."""
         self._indices: dict[int, IndexArray] = {}
         self._unpaired: deque[int] = deque(maxlen=_KEPT)
         self._newest_ns = None

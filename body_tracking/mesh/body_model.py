@@ -1,8 +1,8 @@
-"""A skinned body model in SMPL's form, the body of one person by it, and a pose.
+"""A skinned body model in SMPL's form, one person's body in that model, and a pose.
 
-Loper et al., "SMPL: a skinned multi-person linear model", SIGGRAPH Asia 2015. The model that the project ships was
-made from MakeHuman's data by ``scripts/make_body_model.py``; files of SMPL, SMPL-H and SMPL-X load too. Model axes: x
-left, y up, z forward, metres.
+Loper et al., "SMPL: a skinned multi-person linear model", SIGGRAPH Asia 2015. The shipped model was made from
+MakeHuman's data by ``scripts/make_body_model.py``; files of SMPL, SMPL-H and SMPL-X load too. Model axes: x left, y up,
+z forward, metres.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from body_tracking.mesh.model_files import ModelFileError
 from body_tracking.mesh.skinning import forward_kinematics, skin
 
 SHAPES: Final = 10
-"""Shape components that are used: further ones of SMPL's are smaller than its clothes."""
+"""Number of shape components used: the effects of SMPL's further ones are smaller than clothes."""
 DATA: Final = Path(__file__).parent / "data"
 SHIPPED: Final = {1000: DATA / "body_1000.npz", 1500: DATA / "body_1500.npz"}
-"""The project's own model by its number of vertices, about."""
+"""The shipped models by their approximate number of vertices."""
 
 SMPL_JOINTS: Final = (
     *("pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle"),
@@ -37,22 +37,22 @@ JOINTS: Final = tuple(name for name in SMPL_JOINTS if name not in ("left_foot", 
 """The 20 joints of the project's own model."""
 _COUNTS: Final = {24: "SMPL", 52: "SMPL-H", 55: "SMPL-X"}
 _BONES: Final = 8
-"""Most bones of a vertex; smaller weights are given to the others in proportion."""
+"""Largest number of bones per vertex; smaller weights are redistributed in proportion."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyModel:
-    """The shape space of all people, N vertices, J joints, S shape components, K bones of a vertex.
+    """A shape space of people: N vertices, J joints, S shape components, K bones per vertex.
 
     Attributes:
         joint_names: SMPL's names.
         parents: (J,) each before its children; -1 for the first.
         vertices: (N, 3) of the mean shape at rest.
         vertex_shapes: (N, 3, S) per standard deviation of each shape component.
-        pose_shapes: (N, 3, 9 (J - 1)) by the numbers of the rotations less the identity; or (N, 3, 0).
+        pose_shapes: (N, 3, 9 (J - 1)) per entry of the joints' rotation matrices minus the identity; or (N, 3, 0).
         joints: (J, 3) of the mean shape at rest.
-        joint_shapes: (J, 3, S).
-        bones: (N, K) joints that carry each vertex.
+        joint_shapes: (J, 3, S) per standard deviation of each shape component.
+        bones: (N, K) joints that move each vertex.
         weights: (N, K) in [0, 1], their sum 1.
         faces: (F, 3) vertices, counter-clockwise from outside.
         frames: (J, 3, 3) anatomical frames at rest, see :mod:`body_tracking.mesh.anatomy`.
@@ -71,7 +71,7 @@ class BodyModel:
     frames: FloatArray
 
     def body(self, shape: FloatArray | None = None) -> Body:
-        """The body of a person with shape components (S,), standard deviations; the mean person's without.
+        """The body of a person with shape components (S,) in standard deviations; None for the mean person.
 
         Raises:
             ValueError: another number of components, or one that is not finite.
@@ -87,8 +87,8 @@ class BodyModel:
         return self.joint_names.index(joint)
 
     def reduced(self, vertices: int) -> BodyModel:
-        """The same model with about this many vertices, those of the original (Jatesiktat 2018, figure 1 and section
-        II-B); itself if it has no more.
+        """The model with about this many of its vertices (Jatesiktat 2018, figure 1 and section II-B); the model itself
+        if it has no more.
         """
         if vertices >= len(self.vertices):
             return self
@@ -139,7 +139,7 @@ class Pose:
 
     Attributes:
         rotations: (J, 3, 3) of each joint relative to its parent; of the first in the camera's frame.
-        translation: (3,) metres: of the first joint from its place at rest.
+        translation: (3,) metres: displacement of the first joint from its position at rest.
     """
 
     rotations: FloatArray
@@ -151,7 +151,7 @@ class PosedBody:
     """A body in a pose.
 
     Attributes:
-        rest: (N, 3) vertices at rest, the pose's blend shapes included.
+        rest: (N, 3) vertices at rest, including the pose's blend shapes.
         vertices: (N, 3) in the camera's frame.
         turned: (J, 3, 3) orientations of the joints.
         placed: (J, 3) positions of the joints.
@@ -167,7 +167,7 @@ def load(path: Path | int = 1000) -> BodyModel:
     """A body model from a file in SMPL's form, or one of :data:`SHIPPED`.
 
     Raises:
-        ModelFileError: not a file of a body model, broken, hostile, or numbers that are no body.
+        ModelFileError: not a body model file, damaged, malicious, or with invalid arrays.
     """
     path = SHIPPED[path] if isinstance(path, int) else path
     arrays = model_files.read(path)
@@ -218,7 +218,7 @@ def _checked(arrays: dict[str, npt.NDArray[Any]]) -> BodyModel:
         frames = _numbers(arrays, "frames", 3)
         if frames.shape != (joint_count, 3, 3) or np.abs(frames @ frames.mT - np.eye(3)).max() > 1e-5:
             raise ValueError(f"frames: expected ({joint_count}, 3, 3) orthonormal matrices")
-    # vertices of no face only carry joints, which their regressed shapes replace
+    # vertices without a face only serve the joint regressor, whose results are stored instead
     kept, compact = np.unique(faces, return_inverse=True)
     bones = np.argsort(-weights[kept], axis=1, kind="stable")[:, : min(_BONES, int((weights > 0.0).sum(axis=1).max()))]
     strongest = np.take_along_axis(weights[kept], bones, axis=1)

@@ -24,7 +24,7 @@ _SKIN: Final = (214, 180, 150)
 
 
 class DepthImage(Codec):
-    """A depth image: stamp in nanoseconds, frame, (height, width) metres; written from ``uint16`` millimetres."""
+    """A depth image: stamp in nanoseconds, frame, (height, width) metres; encoded from ``uint16`` millimetres."""
 
     type_name = IMAGE
 

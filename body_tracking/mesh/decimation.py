@@ -1,7 +1,7 @@
-"""Fewer vertices: edges contracted to one of their ends, the cheapest first, by quadric errors.
+"""Mesh decimation by quadric errors: edges are contracted to one of their ends, the cheapest first.
 
-Garland and Heckbert, "Surface simplification using quadric error metrics", SIGGRAPH 1997. The vertex that stays keeps
-its place, so that blend shapes and skinning weights of the original stay exact where there is still a vertex.
+Garland and Heckbert, "Surface simplification using quadric error metrics", SIGGRAPH 1997. The remaining vertex keeps
+its place, so that the original's blend shapes and skinning weights stay exact at the remaining vertices.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ import numpy as np
 from body_tracking.core.skeleton import FloatArray, IntArray
 
 _LENGTH_COST = 1e-3
-"""Of a squared edge against the squared distance from planes: keeps triangles of flat regions of similar size."""
+"""Weight of a squared edge length against the squared distance from planes; keeps triangles in flat regions similar."""
 
 
 def decimate(vertices: FloatArray, faces: IntArray, wanted: int) -> IntArray:
-    """Faces (M, 3) of a mesh with at most ``wanted`` of the vertices referenced, by the old vertex numbers.
+    """Decimated faces (M, 3) that refer to at most ``wanted`` vertices, by their original numbers.
 
     Args:
         vertices: (N, 3).
         faces: (F, 3) triangles.
-        wanted: vertices to keep; more stay where no edge can be contracted without damage to the surface.
+        wanted: number of vertices to keep; more remain where no edge can be contracted without damage to the surface.
     """
     around: list[set[int]] = [set() for _ in vertices]
     corners = [list(map(int, face)) for face in faces]
@@ -67,7 +67,7 @@ def decimate(vertices: FloatArray, faces: IntArray, wanted: int) -> IntArray:
 
     left = sum(1 for each in around if each)
     progress = True
-    # an edge that was refused may be free once those around it are gone, so all are offered again
+    # a rejected edge may become valid once its neighbours are contracted, so all edges are tried again
     while left > wanted and progress:
         progress = False
         heap.clear()
@@ -79,7 +79,7 @@ def decimate(vertices: FloatArray, faces: IntArray, wanted: int) -> IntArray:
             if not (around[gone] and around[kept]) or (version[gone], version[kept]) != (old_gone, old_kept):
                 continue
             shared = around[gone] & around[kept]
-            # the surface stays a manifold where both ends share only the corners of the faces that vanish
+            # the surface stays a manifold if the ends have no other common neighbours than the vanishing faces' corners
             if len(neighbours(gone) & neighbours(kept)) != len(shared) or flips(gone, kept):
                 continue
             for number in shared:

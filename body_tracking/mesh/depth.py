@@ -1,7 +1,7 @@
 """Depth images: back-projection, surface normals, and rejection of edges and flying pixels.
 
-A depth image is a (height, width) float32 array of the distances along the optical axis, metres; 0 where nothing was
-measured. Points are in the camera's optical frame (x right, y down, z forward).
+A depth image is a (height, width) float32 array of distances along the optical axis, metres; 0 where missing. Points
+are in the camera's optical frame (x right, y down, z forward).
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray, SingleArray
 
 FARTHEST: Final = 12.0
-"""Metres; no depth camera that people are tracked with measures farther."""
+"""Metres: the range of depth cameras for tracking people is smaller."""
 _NOISE: Final = (1.13e-3, 0.129e-3)
-"""Axial noise of a Kinect v2, standard deviation in metres: constant part, and per square metre of distance; 1.5 mm at
-1.7 m and 4.1 mm at 4.8 m, measured on a real frame (benchmarks/depth_images.py)."""
+"""Axial noise of a Kinect v2, standard deviation: constant part in metres, and part per square metre of distance
+squared; 1.5 mm at 1.7 m and 4.1 mm at 4.8 m, measured on a real frame (benchmarks/depth_images.py)."""
 
 
 class DepthError(BodyTrackingError):
-    """A depth image that cannot be used, or one of another size than its camera's."""
+    """Raised for an invalid depth image, or one whose size differs from its camera's."""
 
 
 def to_metres(pixels: NDArray[Any]) -> SingleArray:
-    """A depth image of (height, width) pixels: unsigned integers are millimetres (16UC1), floats metres (32FC1).
+    """Depth in metres from (height, width) pixels: unsigned integers are millimetres (16UC1), floats metres (32FC1).
 
-    Zero, NaN, infinite, negative distances and those beyond 12 m become 0: missing (REP-118).
+    Zero, NaN, infinite and negative distances and those beyond 12 m become 0, missing (REP-118).
 
     Raises:
         DepthError: not a two-dimensional array of ``uint16`` or floats.
@@ -47,7 +47,7 @@ def to_metres(pixels: NDArray[Any]) -> SingleArray:
 
 
 def axial_noise(distance: FloatArray) -> FloatArray:
-    """Standard deviation of a Kinect v2's depth on a surface that faces it, metres, at distances in metres."""
+    """Standard deviation of a Kinect v2's depth on a surface facing it, metres; argument: distance in metres."""
     return np.asarray(_NOISE[0] + _NOISE[1] * np.square(distance))
 
 
@@ -67,10 +67,10 @@ class Cloud:
 
 
 def check_size(depth: NDArray[Any], camera: Camera) -> None:
-    """Check that an image has the size for which a camera is calibrated.
+    """Check that an image has the size of a calibrated camera.
 
     Raises:
-        DepthError: it has not.
+        DepthError: another size.
     """
     height, width = depth.shape
     if (width, height) != (camera.width, camera.height):
@@ -81,10 +81,10 @@ def check_size(depth: NDArray[Any], camera: Camera) -> None:
 
 
 class DepthCamera:
-    """A depth camera with the viewing direction of each of its pixels.
+    """A depth camera with precomputed viewing directions of its pixels.
 
     Args:
-        camera: intrinsics with distortion.
+        camera: intrinsics including distortion.
 
     Attributes:
         rays: (height, width, 2) x/z and y/z of each pixel; NaN where the distortion has no inverse.
@@ -97,15 +97,15 @@ class DepthCamera:
         self.rays: SingleArray = camera.undistort(pixels).astype(np.float32)
 
     def check(self, depth: SingleArray) -> None:
-        """Check that an image is of this camera's size.
+        """Check that an image has this camera's size.
 
         Raises:
-            DepthError: it is not.
+            DepthError: another size.
         """
         check_size(depth, self.camera)
 
     def points(self, depth: SingleArray) -> SingleArray:
-        """(height, width, 3) points of all pixels, metres; NaN where nothing was measured.
+        """(height, width, 3) points of all pixels, metres; NaN where missing.
 
         Raises:
             DepthError: another size than the camera's.
@@ -118,8 +118,8 @@ class DepthCamera:
         """At most ``count`` points of a mask, spread evenly over its pixels, with normals.
 
         A normal is the direction of least variance of the neighbours within ``radius`` pixels (Chebyshev) and
-        ``reach`` metres (Jatesiktat 2018, section II-H); the pixels are every n-th of the mask in the order of rows, so
-        that equal images give equal samples.
+        ``reach`` metres (Jatesiktat 2018, section II-H). Pixels are taken at even intervals in row order, so that equal
+        images give equal samples.
 
         Raises:
             DepthError: another size than the camera's, or than the mask's.
@@ -141,9 +141,9 @@ class DepthCamera:
 def normals_at(
     depth: SingleArray, rays: SingleArray, rows: IntArray, columns: IntArray, radius: int, reach: float
 ) -> FloatArray:
-    """(n, 3) unit normals towards the camera at n pixels, by a principal component analysis of their neighbours.
+    """(n, 3) unit normals towards the camera at n pixels, by principal component analysis of their neighbours.
 
-    Jatesiktat (2018): section II-H. The least eigenvector of the (3, 3) scatter is found by inverse iteration.
+    Jatesiktat (2018): section II-H. Inverse iteration finds the least eigenvector of the (3, 3) scatter matrix.
 
     Args:
         depth: (height, width) metres.
@@ -154,7 +154,7 @@ def normals_at(
         reach: greatest distance of a neighbour, metres.
 
     Returns:
-        NaN with fewer than 6 neighbours, or where these lie on a line.
+        Normals; NaN with fewer than 6 neighbours, or with collinear neighbours.
     """
     height, width = depth.shape
     normals = np.full((len(rows), 3), np.nan)
@@ -186,7 +186,7 @@ def normals_at(
             continue
         xx, yy, zz = xx / n - mx * mx / n / n, yy / n - my * my / n / n, zz / n - mz * mz / n / n
         xy, xz, yz = xy / n - mx * my / n / n, xz / n - mx * mz / n / n, yz / n - my * mz / n / n
-        # the shift keeps the inverse finite on a perfect plane and leaves the eigenvectors as they are
+        # the shift keeps the inverse finite on a perfect plane and does not change the eigenvectors
         shift = 1e-6 * (xx + yy + zz) + 1e-15
         a, b, c = xx + shift, yy + shift, zz + shift
         # adjugate: the inverse up to its scale
@@ -199,7 +199,7 @@ def normals_at(
             if size <= 0.0:
                 break
             u, v, w = u / size, v / size, w / size
-        # neighbours on a line leave two directions of least variance
+        # collinear neighbours leave two directions of least variance
         middle = (
             i00
             + i11
@@ -218,18 +218,17 @@ def normals_at(
 
 @compiled
 def supported(depth: SingleArray, jump: float, least: int) -> BoolArray:
-    """Pixels that lie on a surface: neither flying between two surfaces nor on the edge of one.
+    """Mask of pixels on a surface: neither flying pixels nor on a surface's edge.
 
-    A flying pixel averages foreground and background within one pixel of a time-of-flight camera; few of its neighbours
-    are at its own distance.
+    A flying pixel of a time-of-flight camera averages foreground and background; few neighbours share its distance.
 
     Args:
         depth: (height, width) metres, 0 where missing.
-        jump: largest difference of depth to a neighbour on the same surface, as a share of the distance.
-        least: how many of the 8 neighbours have to be on the same surface.
+        jump: largest depth difference between neighbours on one surface, as a share of the distance.
+        least: least number of the 8 neighbours on the pixel's surface.
 
     Returns:
-        (height, width); False where nothing was measured.
+        (height, width); False where depth is missing.
     """
     height, width = depth.shape
     good = np.zeros((height, width), dtype=np.bool_)
@@ -244,7 +243,7 @@ def supported(depth: SingleArray, jump: float, least: int) -> BoolArray:
                     other = depth[a, b]
                     if other > 0.0 and abs(other - z) <= limit:
                         count += 1
-            # the pixel itself was counted too
+            # count includes the pixel itself
             good[i, j] = count > least
     return good
 

@@ -1,11 +1,12 @@
-"""The terms that a pose is fitted by: residuals of one number each and their analytic Jacobians.
+"""Energy terms of a pose: scalar residuals and their analytic Jacobians.
 
-Jatesiktat, Anopas and Ang (2018), eq. 4: data (5), background (6), nothing in front of what was measured (12), limits
-(8) and inertial sensors (9-11). The data term is the distance of a measured point from the plane of the nearest surface
-that faces the same way; the inertial term compares whole orientations, where the paper's has the forearm's direction
-only. All of them are sums of squares of ``(direction . x - target) / deviation`` of points x on the body, or of angles.
+Jatesiktat, Anopas and Ang (2018), eq. 4: data (5), background (6), model in front of the measured surface (12), limits
+(8) and inertial sensors (9-11). The data residual is the distance of a measured point from the tangent plane of the
+nearest surface point that faces the same way. The inertial residual compares whole orientations, where the paper's
+compares only the forearm's direction. All terms are sums of squares of ``(direction . x - target) / deviation`` of
+points x on the body, or of angles.
 
-A pose is changed by (6 + 3 (J - 1),) numbers: a shift of the first joint, metres, then for every joint a rotation of
+A change of the pose has 6 + 3 (J - 1) numbers: a shift of the first joint, metres, then for every joint a rotation of
 its segment about the axes of its anatomical frame, radians.
 """
 
@@ -23,25 +24,25 @@ from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray, SingleA
 from body_tracking.mesh.depth import DepthCamera
 
 QUARTER: Final = 4
-"""Pixels of the depth image per pixel of the distance transform."""
+"""Pixels of the depth image per pixel of the distance transform, along each axis."""
 MARGIN: Final = 0.05
-"""Metres by which a surface has to lie in front of what was measured there to count as in front: clothes and shape."""
+"""Metres in front of the measured surface, up to which a model point is tolerated: clothes and shape."""
 GRAZING: Final = 0.3
-"""Cosine between a surface's normal and the ray to it, up to which it counts as facing the camera."""
+"""Cosine between a surface's outward normal and the viewing ray, below which the surface counts as visible."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
-    """What one depth image shows of a person.
+    """Observation of a person in one depth image.
 
     Attributes:
         points: (n, 3) metres in the camera's frame.
         normals: (n, 3) unit, towards the camera; zero where unknown.
         depth: (height, width) metres, 0 where missing.
         mask: (height, width) the person's pixels.
-        outside: (height / 4, width / 4) pixels of the depth image to the nearest pixel of the person, 0 on it.
+        outside: (height / 4, width / 4) distance to the person's nearest pixel, in pixels of the depth image; 0 on it.
         slope: (height / 4, width / 4, 2) change of ``outside`` per pixel to the right and down.
-        camera: whose image it is.
+        camera: the image's camera.
     """
 
     points: FloatArray
@@ -54,20 +55,20 @@ class Observation:
 
 
 def observe(camera: DepthCamera, depth: SingleArray, mask: BoolArray, count: int = 600) -> Observation:
-    """Points and silhouette of a person.
+    """Sample points and compute the silhouette's distance transform.
 
     Args:
         camera: the depth camera.
         depth: (height, width) metres, 0 where missing.
         mask: (height, width) the person's pixels.
-        count: points to sample.
+        count: number of points to sample.
 
     Raises:
         DepthError: another size than the camera's.
     """
     cloud = camera.sample(depth, mask, count)
     height, width = (QUARTER * (n // QUARTER) for n in mask.shape)
-    # the mean of a block is above 0 where any of its pixels is the person's
+    # the mean of a block is above 0 if any of its pixels is the person's
     whole = 255 * mask[:height, :width].astype(np.uint8)
     blocks = np.asarray(cv2.resize(whole, (width // QUARTER, height // QUARTER), interpolation=cv2.INTER_AREA)) > 0
     outside = QUARTER * cv2.distanceTransform(np.asarray(~blocks, dtype=np.uint8), cv2.DIST_L2, 3).astype(np.float32)
@@ -84,14 +85,14 @@ def observe(camera: DepthCamera, depth: SingleArray, mask: BoolArray, count: int
 
 
 class Matches(NamedTuple):
-    """Measured points and the points of the surface that they belong to.
+    """Correspondences of measured points on the model's surface.
 
     Attributes:
         corners: (n, 3) vertices of the face.
         shares: (n, 3) barycentric coordinates.
         places: (n, 3) points on the surface.
         normals: (n, 3) unit normals there.
-        agreements: (n,) cosine between measured normal and that of the surface.
+        agreements: (n,) cosine between the measured normal and the surface's.
     """
 
     corners: IntArray
@@ -102,11 +103,11 @@ class Matches(NamedTuple):
 
 
 class Pulls(NamedTuple):
-    """Points on the body that are outside of the silhouette or in front of what was measured.
+    """Model points outside the silhouette or in front of the measured surface.
 
     Attributes:
-        vertices: (m,) their numbers.
-        directions: (m, 3) along which the residual grows, per metre.
+        vertices: (m,) vertex indices.
+        directions: (m, 3) gradient of the residual by the vertex.
         residuals: (m,) metres.
         kinds: (m,) 0 for background (6), 1 for in front of the measured surface (12).
     """
@@ -118,7 +119,7 @@ class Pulls(NamedTuple):
 
 
 def faces_around(faces: IntArray, vertices: int) -> tuple[IntArray, IntArray]:
-    """Faces around each vertex: (N + 1,) starts in (3 F,) numbers of faces."""
+    """Faces around each vertex: (N + 1,) start indices into (3 F,) face indices."""
     order = np.argsort(faces.ravel(), kind="stable")
     starts = np.searchsorted(faces.ravel()[order], np.arange(vertices + 1))
     return starts.astype(np.intp), (order // 3).astype(np.intp)
@@ -134,7 +135,7 @@ def match(
     around: IntArray,
     turn_cost: float,
 ) -> Matches:
-    """For each measured point the surface that is nearest and faces the same way.
+    """Match each measured point with the nearest surface that faces the same way.
 
     Jatesiktat (2018), eq. 17 and section II-J.
 
@@ -146,12 +147,12 @@ def match(
         faces: (F, 3).
         starts: (N + 1,), with ``around``, of :func:`faces_around`.
         around: see ``starts``.
-        turn_cost: metres that a difference of 1 between unit normals counts as.
+        turn_cost: distance in metres equivalent to a difference of 1 between unit normals.
     """
-    # what faces away from the camera is not seen; the edges count, as clothes are wider
+    # surfaces that face away are invisible; the tolerance keeps grazing edges, because clothes are wider
     views = (vertices * vertex_normals).sum(axis=1)
     facing = np.flatnonzero(views < GRAZING * np.sqrt((vertices * vertices).sum(axis=1)))
-    # |p - v|^2 + turn_cost^2 |n - m|^2 up to terms of the point alone: one product of matrices for all pairs
+    # |p - v|^2 + turn_cost^2 |n - m|^2 up to terms of the point alone: one matrix product for all pairs
     middle = points.mean(axis=0) if len(points) else np.zeros(3)
     seen = (vertices[facing] - middle).astype(np.float32)
     pairs = np.concatenate([seen, vertex_normals[facing].astype(np.float32)], axis=1)
@@ -173,7 +174,7 @@ def _refined(
     starts: IntArray,
     around: IntArray,
 ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """The nearest points on the faces around the nearest vertices (n,), as the fields of :class:`Matches`."""
+    """Nearest points on the faces around the nearest vertices (n,), as the fields of :class:`Matches`."""
     corners = np.zeros((len(points), 3), dtype=np.intp)
     shares = np.zeros((len(points), 3))
     places = np.zeros((len(points), 3))
@@ -252,10 +253,10 @@ def find_pulls(
     fy: float,
     margin: float,
 ) -> Pulls:
-    """Vertices outside of the silhouette, and in front of what was measured on the person.
+    """Find vertices outside the silhouette, and vertices in front of the surface measured on the person.
 
-    Jatesiktat (2018), eq. 6 and 12. A pixel without a measurement says nothing, and so does one where something else is
-    nearer.
+    Jatesiktat (2018), eq. 6 and 12. Pixels without a measurement, and pixels where something nearer hides the model,
+    give no residual.
 
     Args:
         vertices: (N, 3) posed.
@@ -296,11 +297,11 @@ def find_pulls(
             directions[count, 2] = -(sx * x + sy * y) / z * scale
             kinds[count] = 0
         elif mask[row, column]:
-            # back behind the surface: the residual falls as z grows
+            # moves the vertex behind the surface: the residual falls as z grows
             residuals[count] = measured - margin - z
             directions[count, 2] = -1.0
             kinds[count] = 1
-        else:  # on the outline, within the distance transform's resolution
+        else:  # outside the mask, but within the distance transform's resolution
             continue
         count += 1
     return Pulls(numbers[:count], directions[:count], residuals[:count], kinds[:count])
@@ -310,7 +311,7 @@ def find_pulls(
 def behind_others(
     vertices: FloatArray, pixels: FloatArray, depth: SingleArray, mask: BoolArray, margin: float
 ) -> FloatArray:
-    """(N,) 1 for vertices behind a surface that is not the person's, 0 for others; arguments as of
+    """(N,) 1 for vertices hidden behind a surface that is not the person's, else 0; arguments as in
     :func:`find_pulls`.
     """
     height, width = depth.shape
@@ -334,12 +335,12 @@ def accumulate(
     information: FloatArray,
     gradient: FloatArray,
 ) -> None:
-    """Add the normal equations of residuals that are linear in points on the body, in place.
+    """Add the normal equations of residuals of points on the body, in place.
 
     Args:
         arms: (n, J, 3) of :func:`body_tracking.mesh.skinning.lever_arms`.
         frames: (J, 3, 3) anatomical frames of the posed segments, columns in the camera's axes.
-        directions: (n, 3) the gradient of each residual by its point.
+        directions: (n, 3) gradient of each residual by its point.
         residuals: (n,).
         weights: (n,) inverse variances.
         information: (3 + 3 J, 3 + 3 J) the sum of w j^T j; its lower triangle is filled.

@@ -1,14 +1,14 @@
-"""The published method of Jatesiktat, Anopas and Ang (2018): a baseline to compare ours with, not used by any node.
+"""The published method of Jatesiktat, Anopas and Ang (2018), as a baseline for comparison; no node uses it.
 
 Its correspondences are variables of the fit, beside the pose; its energy has the terms of eq. 5-12 with the weights of
-section IV-C. The IMU term needs the direction of a forearm only.
+section IV-C. The IMU term uses only the direction of a forearm.
 
-What the paper leaves open is read as follows. Eq. 6 and 7 are in pixels, eq. 8 in radians, eq. 12 in metres. There are
-37 degrees of freedom with the body model of 20 joints, 40 in the paper; the limits are those of ``kinematics.ranges``.
-A success divides the damping by 10, a failure multiplies it by 10. Each candidate set has 250 points. Pixels are chosen
-by six parts of the body, half of them near the outline. The body's shape is given.
+Interpretation of points that the paper leaves open: eq. 6 and 7 are in pixels, eq. 8 in radians, eq. 12 in metres. The
+body model of 20 joints has 37 degrees of freedom, the paper's 40; the limits are those of ``kinematics.ranges``. A
+success divides the damping by 10, a failure multiplies it by 10. Each candidate set has 250 points. Pixels are sampled
+by six parts of the body, half of each near the outline. The body's shape is given.
 
-Over 500 lines: one paper's method, whose terms share what is looked up of an image.
+Over 500 lines: the terms of one paper's method share look-ups in an image.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ from body_tracking.mesh.uncertainty import kinect_landmarks
 
 @dataclass(frozen=True, slots=True)
 class Configuration:
-    """Weights and numbers of Jatesiktat (2018), section IV-C.
+    """Weights and sizes of Jatesiktat (2018), section IV-C.
 
     Attributes:
-        samples: N_s, pixels of the depth image.
-        sigma_p: metres.
-        sigma_n: of unit normals.
+        samples: N_s, sampled pixels of the depth image.
+        sigma_p: standard deviation of positions, metres.
+        sigma_n: standard deviation of unit normals.
         background, joints, front, limit, imu: the lambdas of eq. 4.
         silhouette: H_max, points on the model's outline.
         iterations: of Levenberg-Marquardt per image.
-        damping: gamma at first.
-        window: images of the moving average.
+        damping: initial gamma.
+        window: images in the moving average.
     """
 
     samples: int = 250
@@ -66,18 +66,18 @@ _THREE: Final = ("spine1", "spine2", "spine3", "neck", "head")
 _TWO: Final = tuple(f"{side}_{joint}" for joint in ("collar", "shoulder", "elbow", "wrist") for side in SIDES)
 _LEGS: Final = ("hip", "knee", "ankle", "foot")
 _BACKGROUND_JOINTS: Final = ("pelvis", *_THREE, *_TWO, "left_hip", "right_hip")
-"""The 16 joints of eq. 7, which the paper does not name."""
+"""The 16 joints of eq. 7; the paper does not list them."""
 _DENSE: Final = ("shoulder", "elbow", "wrist", "neck", "head")
-"""Segments that have three times as many candidates (section II-J)."""
+"""Segments with three times as many candidates (section II-J)."""
 _SETS, _CANDIDATES = 10, 250
 _VOXEL: Final = 0.02
-"""Metres: resolution of the volume of eq. 12."""
+"""Metres: voxel size of the volume of eq. 12."""
 _STEP: Final = 1e-6
-"""Step of the differences that the Jacobian comes from."""
+"""Step of the numerical differentiation of the Jacobian."""
 _DESCENTS: Final = 5000
-"""Most steps of the gradient descent of eq. 19: in metres it is slow."""
+"""Largest number of steps of the gradient descent of eq. 19, which converges slowly in metres."""
 _NEAR_OUTLINE: Final = 5.0
-"""Pixels."""
+"""Pixels from the outline, below which a pixel is near it."""
 _PARTS: Final = (
     (0.3, (("SPINE_BASE", "SPINE_SHOULDER"), ("SHOULDER_LEFT", "SHOULDER_RIGHT"), ("HIP_LEFT", "HIP_RIGHT"))),
     (0.14, (("NECK", "HEAD"),)),
@@ -92,17 +92,17 @@ _PARTS: Final = (
         ),
     ),
 )
-"""Share of the samples and bones of each part of the body."""
+"""Share of the samples, and the bones, of each part of the body."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """What the terms need of one depth image.
+    """Data of one depth image for the energy terms.
 
     Attributes:
         points: (n, 3) metres.
         normals: (n, 3) unit.
-        camera: whose image it is.
+        camera: the image's camera.
         nearest: (height, width, 2) column and row of the nearest pixel of the silhouette.
         origin: (3,) metres, of the volume of eq. 12.
         behind: (a, b, c, 3) indices of the nearest voxel behind the measured surface.
@@ -117,12 +117,12 @@ class Frame:
 
 
 class Fitted(NamedTuple):
-    """A pose by Levenberg-Marquardt.
+    """Result of Levenberg-Marquardt.
 
     Attributes:
         theta: (37,) pose parameters.
         energy: eq. 4.
-        iterations: that it took.
+        iterations: number used.
     """
 
     theta: FloatArray
@@ -131,13 +131,13 @@ class Fitted(NamedTuple):
 
 
 class _Selected(NamedTuple):
-    """Points that the terms of the background and of the front are made of, selected anew in each iteration."""
+    """Points of the background and front terms, selected again in each iteration."""
 
     outline: SurfacePoints
     targets: FloatArray | None
-    """(H + 16, 2) pixels, and..."""
+    """(H + 16, 2) pixels, held while the Jacobian is computed; None to look them up."""
     behind: FloatArray | None
-    """(H, 3) metres, held while the Jacobian is computed; None to look them up."""
+    """(H, 3) metres, likewise."""
 
 
 class JatesiktatFitter:
@@ -145,8 +145,8 @@ class JatesiktatFitter:
 
     Args:
         body: of the person.
-        configuration: weights and numbers.
-        rng: of the candidates.
+        configuration: weights and sizes.
+        rng: for the candidates.
     """
 
     def __init__(
@@ -158,7 +158,7 @@ class JatesiktatFitter:
         names = model.joint_names
         legs = [number for number, name in enumerate(names) if name.rpartition("_")[2] in _LEGS]
         strongest = model.bones[np.arange(len(model.vertices)), model.weights.argmax(axis=1)]
-        # "from the hips and above"
+        # the paper: "from the hips and above"
         upper = model.faces[~np.isin(strongest[model.faces], legs).any(axis=1)]
         self._faces = np.ascontiguousarray(upper)
         self._across = neighbours(self._faces)
@@ -184,7 +184,7 @@ class JatesiktatFitter:
         self._edge_corners = np.tile([[0, 1], [1, 2], [2, 0]], (len(self._faces), 1))[once]
 
     def _across_bone(self, joint: int) -> FloatArray:
-        """(3, 2) two axes across a bone at rest: its roll is removed (Jatesiktat 2018, section II-B)."""
+        """(3, 2) two axes perpendicular to a bone at rest, without its roll (Jatesiktat 2018, section II-B)."""
         model = self.body.model
         children = np.flatnonzero(model.parents == joint)
         along = self.body.joints[children[0]] - self.body.joints[joint] if len(children) else -model.frames[joint][:, 2]
@@ -193,7 +193,7 @@ class JatesiktatFitter:
     # --- pose parameters
 
     def pose(self, theta: FloatArray) -> Pose:
-        """The pose with parameters (37,): place and turn of the first joint, then the turns of the others."""
+        """The pose with parameters (37,): position and rotation of the first joint, then rotations of the others."""
         rotations = np.tile(np.eye(3), (len(self.body.joints), 1, 1))
         vectors = [theta[3:6]]
         start = 6
@@ -207,7 +207,7 @@ class JatesiktatFitter:
         return Pose(rotations, theta[:3] - self.body.joints[0])
 
     def kinect_start(self, joints: FloatArray) -> FloatArray:
-        """(37,) the pose that replicates a Kinect's skeleton (Jatesiktat 2018, section II-G).
+        """(37,) parameters of the pose that replicates a Kinect's skeleton (Jatesiktat 2018, section II-G).
 
         Args:
             joints: (25, 3) metres in the optical frame; NaN where a joint is not tracked.
@@ -249,10 +249,10 @@ class JatesiktatFitter:
         numbers = [axes.T @ vectors[joint] for axes, joint in zip(self._axes, self._moved.tolist(), strict=True)]
         return np.concatenate([place, vectors[0], *numbers])
 
-    # --- what an image shows
+    # --- data of an image
 
     def frame(self, view: DepthCamera, depth: SingleArray, mask: BoolArray, joints: FloatArray) -> Frame:
-        """Samples (Jatesiktat 2018, section II-H) of what comes in (section II-A), and what eq. 6, 7 and 12 look up.
+        """Samples of an image (Jatesiktat 2018, sections II-A and II-H), and the look-up tables of eq. 6, 7 and 12.
 
         Args:
             view: the depth camera.
@@ -310,14 +310,14 @@ class JatesiktatFitter:
         selected: _Selected,
         directions: Mapping[str, FloatArray],
     ) -> FloatArray:
-        """The vector of residuals (Jatesiktat 2018, eq. 13-14) of the terms eq. 5-12; its square is the energy (eq. 4).
+        """Residual vector (Jatesiktat 2018, eq. 13-14) of the terms eq. 5-12; its squared norm is the energy (eq. 4).
 
         Args:
             theta: (37,) pose.
             matches: of the samples.
             frame: the image.
-            selected: points of the background's and the front's terms.
-            directions: by side, the forearm's direction (3,) by an IMU.
+            selected: points of the background and front terms.
+            directions: by side, the forearm's direction (3,) from an IMU.
         """
         c, posed = self.configuration, self.body.posed(self.pose(theta))
         faces, vertices = self._faces, posed.vertices
@@ -361,8 +361,8 @@ class JatesiktatFitter:
         return np.asarray(along / np.linalg.norm(along))
 
     def _selected(self, posed: PosedBody) -> SurfacePoints:
-        """Points where the normal is perpendicular to the optical axis (Jatesiktat 2018, eq. 6): on edges between a
-        vertex that faces the camera and one that does not, at most ``silhouette``.
+        """Points with a normal perpendicular to the optical axis (Jatesiktat 2018, eq. 6): on edges between a vertex
+        that faces the camera and one that does not, at most ``silhouette``.
         """
         facing = vertex_normals(posed.vertices, self._faces)[:, 2]
         first, second = facing[self._edges].T
@@ -382,12 +382,12 @@ class JatesiktatFitter:
     def fit(
         self, frame: Frame, starts: Sequence[FloatArray], directions: Mapping[str, FloatArray] | None = None
     ) -> Fitted:
-        """The pose with the lowest energy of those from all starts (Jatesiktat 2018, section II-G).
+        """Fit from all starts; returns the pose with the lowest energy (Jatesiktat 2018, section II-G).
 
         Args:
             frame: the image.
             starts: (37,) each: the last image's pose, and that of the Kinect's skeleton.
-            directions: by side, the forearm's direction (3,) by an IMU.
+            directions: by side, the forearm's direction (3,) from an IMU.
         """
         return min((self._descend(frame, start, directions or {}) for start in starts), key=lambda each: each.energy)
 
@@ -423,7 +423,7 @@ class JatesiktatFitter:
     def _rematched(
         self, theta: FloatArray, matches: SurfacePoints, candidates: SurfacePoints, frame: Frame
     ) -> SurfacePoints:
-        """Correspondences chosen anew (Jatesiktat 2018, eq. 17; section II-J)."""
+        """Correspondences searched again (Jatesiktat 2018, eq. 17; section II-J)."""
         vertices = self.body.posed(self.pose(theta)).vertices
         normals, c = vertex_normals(vertices, self._faces), self.configuration
         own = frame.points, frame.normals, matches.faces, matches.shares, candidates.faces, candidates.shares
@@ -440,11 +440,11 @@ class JatesiktatFitter:
         directions: Mapping[str, FloatArray],
         posed: PosedBody,
     ) -> tuple[FloatArray, FloatArray]:
-        """(K, 37) by the pose, by differences, and (n, 6, 2) of the data term by u and v."""
+        """Jacobians (K, 37) by the pose, numerical, and (n, 6, 2) of the data term by u and v, analytic."""
         outline = selected.outline.places(posed.vertices, self._faces)
         pixels = frame.camera.project(np.concatenate([outline, posed.placed[self._background]]))
         targets, behind = nearest_inside(frame, pixels), nearest_behind(frame, outline)
-        # what is inside already has no residual, and no derivative
+        # points inside have neither a residual nor a derivative
         targets = np.where((targets == pixels).all(axis=1, keepdims=True), np.nan, targets)
         behind = np.where((behind == outline).all(axis=1, keepdims=True), np.nan, behind)
         held = _Selected(selected.outline, targets, behind)
@@ -469,9 +469,9 @@ class JatesiktatFitter:
 def _step(
     by_pose: FloatArray, by_match: FloatArray, residuals: FloatArray, damping: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Changes of pose (P,) and of u and v (n, 2) (Jatesiktat 2018, eq. 16); correspondences are eliminated first."""
+    """Steps of the pose (P,) and of u and v (n, 2) (Jatesiktat 2018, eq. 16); eliminates the correspondences first."""
     n = len(by_match)
-    # rows of a point: its place's, then its normal's
+    # each point has rows for its position, then for its normal
     places, normals = by_pose[: 3 * n].reshape(n, 3, -1), by_pose[3 * n : 6 * n].reshape(n, 3, -1)
     rows = np.concatenate([places, normals], axis=1)
     own = np.concatenate([residuals[: 3 * n].reshape(n, 3), residuals[3 * n : 6 * n].reshape(n, 3)], axis=1)
@@ -486,9 +486,9 @@ def _step(
 
 
 def rough_shape(model: BodyModel, joints: FloatArray) -> FloatArray:
-    """(S,) shape components whose lengths are near those of a Kinect's skeleton (Jatesiktat 2018, section III-A).
+    """(S,) shape components with segment lengths near those of a Kinect's skeleton (Jatesiktat 2018, section III-A).
 
-    The lengths' squared differences (eq. 18), in metres, fall by gradient descent from the mean shape (eq. 19).
+    Gradient descent from the mean shape (eq. 19) on the squared differences of lengths (eq. 18), in metres.
 
     Args:
         model: shape space.
@@ -516,10 +516,10 @@ def rough_shape(model: BodyModel, joints: FloatArray) -> FloatArray:
 
 
 def _lengths(joints: FloatArray, shapes: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(7,) metres of eq. 18 and their derivatives (7, S), of joints (25, 3) that shapes move by (25, 3, S)."""
+    """Lengths (7,) of eq. 18, metres, and derivatives (7, S); shapes (25, 3, S) are the joints' derivatives."""
 
     def between(*ends: tuple[str, str]) -> tuple[float, FloatArray]:
-        """The distance of two points, each the mean of a left and a right joint; the mean over several pairs."""
+        """Distance of two points, each the mean of a left and a right joint; averaged over several pairs."""
         found, slopes = [], []
         for one, other in ends:
             first, second = ([joint for joint in Joint if joint.name in _both(name)] for name in (one, other))
@@ -553,9 +553,9 @@ def _both(name: str) -> tuple[str, ...]:
 
 
 def moving_average(thetas: FloatArray, window: int = 3) -> FloatArray:
-    """(n, P) means of consecutive poses (Jatesiktat 2018, section IV-C), centred: half a window of delay.
+    """(n, P) centred means of consecutive poses (Jatesiktat 2018, section IV-C), with a delay of half a window.
 
-    At the ends the window is shorter.
+    The window is shorter at the ends.
     """
     half = window // 2
     rows = [thetas[max(k - half, 0) : k + half + 1].mean(axis=0) for k in range(len(thetas))]
@@ -563,7 +563,7 @@ def moving_average(thetas: FloatArray, window: int = 3) -> FloatArray:
 
 
 def nearest_inside(frame: Frame, pixels: FloatArray) -> FloatArray:
-    """(n, 2) the nearest pixel of the silhouette: D_2D of Jatesiktat (2018), eq. 6; the point itself inside of it."""
+    """(n, 2) nearest pixel of the silhouette: D_2D of Jatesiktat (2018), eq. 6; points inside it stay."""
     height, width = frame.nearest.shape[:2]
     at = np.nan_to_num(np.round(pixels)).astype(np.intp)
     columns, rows = at[:, 0].clip(0, width - 1), at[:, 1].clip(0, height - 1)
@@ -575,9 +575,9 @@ def nearest_inside(frame: Frame, pixels: FloatArray) -> FloatArray:
 
 
 def nearest_behind(frame: Frame, points: FloatArray) -> FloatArray:
-    """(n, 3) the nearest voxel behind the measured surface: D_3D of Jatesiktat (2018), eq. 12.
+    """(n, 3) nearest voxel behind the measured surface: D_3D of Jatesiktat (2018), eq. 12.
 
-    A point behind it, outside of the volume, or outside of the silhouette stays where it is.
+    Points behind the surface, outside the volume or outside the silhouette stay.
     """
     at = np.floor((points - frame.origin) / _VOXEL)
     inside = np.all(at >= 0, axis=1) & np.all(at < frame.behind.shape[:3], axis=1)
@@ -590,7 +590,7 @@ def nearest_behind(frame: Frame, points: FloatArray) -> FloatArray:
 
 
 def _volume(view: DepthCamera, depth: SingleArray, seen: BoolArray) -> tuple[FloatArray, IntArray]:
-    """The volume about the person: its origin, and the nearest voxel behind the surface of each."""
+    """Volume around the person: its origin, and for each voxel the nearest voxel behind the surface."""
     z = depth[seen].astype(np.float64)
     points = np.column_stack([view.rays[seen] * z[:, None], z])
     low, high = points.min(axis=0) - 0.2, points.max(axis=0) + 0.4
@@ -608,14 +608,14 @@ def _volume(view: DepthCamera, depth: SingleArray, seen: BoolArray) -> tuple[Flo
 
 
 def _least_turn(one: FloatArray, other: FloatArray) -> FloatArray:
-    """(3,) the shortest rotation vector from one direction to another, which is across both."""
+    """(3,) the shortest rotation vector from one direction to another."""
     axis = np.cross(one, other)
     size = float(np.linalg.norm(axis))
     return np.asarray(np.arctan2(size, float(one @ other)) / max(size, 1e-12) * axis)
 
 
 def _distance(points: FloatArray, joints: FloatArray, bones: Sequence[tuple[str, str]]) -> FloatArray:
-    """(n,) metres from the nearest of the bones; NaN where none is tracked."""
+    """(n,) distance from the nearest bone, metres; NaN if no bone is tracked."""
     found = np.full(len(points), np.nan)
     for first, second in bones:
         a, along = joints[Joint[first]], joints[Joint[second]] - joints[Joint[first]]

@@ -1,7 +1,7 @@
-"""Points that move over the surface of a posed mesh: correspondences that are variables of a fit.
+"""Points that move over the surface of a posed mesh, as correspondences that are variables of a fit.
 
 Jatesiktat, Anopas and Ang (2018): parameterisation (eq. 1-3), mesh walk (section II-I) and discrete update (eq. 17;
-section II-J). A point is a face and two of its barycentric coordinates u and v; the third one is w = 1 - u - v.
+section II-J). A point is a face and two barycentric coordinates u and v; the third one is w = 1 - u - v.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from body_tracking.core.compiled import compiled
 from body_tracking.core.skeleton import FloatArray, IntArray
 
 _MOST_FACES = 50
-"""Faces that a point crosses at most in one walk; those of the body are 3 cm wide."""
+"""Largest number of faces crossed in one walk; the body's faces are 3 cm wide."""
 
 
 class SurfacePoints(NamedTuple):
     """Points on a mesh (Jatesiktat 2018, eq. 1).
 
     Attributes:
-        faces: (n,) numbers of faces.
-        shares: (n, 2) u and v of the first and the second corner.
+        faces: (n,) face indices.
+        shares: (n, 2) u and v, of the first and the second corner.
     """
 
     faces: IntArray
@@ -33,11 +33,11 @@ class SurfacePoints(NamedTuple):
         return np.concatenate([self.shares, 1.0 - self.shares.sum(axis=1, keepdims=True)], axis=1)
 
     def places(self, vertices: FloatArray, faces: IntArray) -> FloatArray:
-        """(n, 3) metres (Jatesiktat 2018, eq. 2), of vertices (N, 3) and faces (F, 3)."""
+        """(n, 3) positions, metres (Jatesiktat 2018, eq. 2), on vertices (N, 3) and faces (F, 3)."""
         return np.asarray(np.einsum("nc,nca->na", self.weights(), vertices[faces[self.faces]]))
 
     def normals(self, vertex_normals: FloatArray, faces: IntArray) -> FloatArray:
-        """(n, 3) unit normals (Jatesiktat 2018, eq. 3), of the vertices' normals (N, 3) and faces (F, 3)."""
+        """(n, 3) unit normals (Jatesiktat 2018, eq. 3) from the vertices' normals (N, 3) and faces (F, 3)."""
         found = np.einsum("nc,nca->na", self.weights(), vertex_normals[faces[self.faces]])
         return np.asarray(found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-12))
 
@@ -57,7 +57,7 @@ def neighbours(faces: IntArray) -> IntArray:
 def random_points(
     vertices: FloatArray, faces: IntArray, density: FloatArray, count: int, rng: np.random.Generator
 ) -> SurfacePoints:
-    """Candidates (Jatesiktat 2018, section II-J): random points, more where ``density`` (F,) is greater."""
+    """Random candidates (Jatesiktat 2018, section II-J), denser where ``density`` (F,) is greater."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1) * density
     chosen = rng.choice(len(faces), size=count, p=area / area.sum())
@@ -68,14 +68,14 @@ def random_points(
 def walk(
     faces: IntArray, across: IntArray, vertices: FloatArray, at: IntArray, shares: FloatArray, steps: FloatArray
 ) -> tuple[IntArray, FloatArray]:
-    """Points moved over the mesh (Jatesiktat 2018, section II-I).
+    """Move points over the mesh (Jatesiktat 2018, section II-I).
 
-    A step that leaves its face goes on in the next one, in the direction in which it would go if both were unfolded
-    into one plane. It ends where the mesh does.
+    A step that leaves its face continues in the next one, in the direction it has when both are unfolded into one
+    plane. It ends at the mesh's border.
 
     Args:
         faces: (F, 3).
-        across: (F, 3) of :func:`neighbours`.
+        across: (F, 3) from :func:`neighbours`.
         vertices: (N, 3) posed.
         at: (n,) faces of the points.
         shares: (n, 2) u and v of the points.
@@ -113,14 +113,14 @@ def walk(
                 length += edge * edge
                 size += vector[a] * vector[a]
                 along += vector[a] * edge
-            # the edge's part of what is left, as a share of the edge, and what is left perpendicular to it, metres
+            # the rest's component along the edge, as a share of the edge, and perpendicular to it, metres
             onward = along / length
             inward = np.sqrt(max(size - along * along / length, 0.0))
             third = 0
             for k in range(3):
                 if faces[g, k] != p and faces[g, k] != q:
                     third = k
-            # the height of the third corner over the edge, and where its foot is, as a share of the edge
+            # height of the third corner over the edge, and position of its foot as a share of the edge
             foot = reach = 0.0
             for a in range(3):
                 rise = vertices[faces[g, third], a] - vertices[p, a]
@@ -158,8 +158,8 @@ def rematched(
     per_metre: float,
     per_normal: float,
 ) -> tuple[IntArray, FloatArray]:
-    """The best of each correspondence and of all candidates (Jatesiktat 2018, eq. 17), and then of the centroids of the
-    faces around it, again until none is better (section II-J).
+    """Best of each correspondence and all candidates (Jatesiktat 2018, eq. 17), then repeatedly of the centroids of the
+    adjacent faces until none is better (section II-J).
 
     Args:
         faces: (F, 3).
@@ -169,11 +169,11 @@ def rematched(
         points: (n, 3) measured.
         normals: (n, 3) measured.
         at: (n,) faces of the correspondences.
-        shares: (n, 2) their u and v.
-        candidates_at: (m,) faces.
-        candidates: (m, 2) u and v.
-        per_metre: inverse deviation of places.
-        per_normal: inverse deviation of unit normals.
+        shares: (n, 2) u and v of the correspondences.
+        candidates_at: (m,) faces of the candidates.
+        candidates: (m, 2) u and v of the candidates.
+        per_metre: inverse standard deviation of positions, 1/m.
+        per_normal: inverse standard deviation of unit normals.
 
     Returns:
         (n,) faces and (n, 2) u and v.
@@ -213,7 +213,7 @@ def rematched(
 def _described(
     faces: IntArray, vertices: FloatArray, vertex_normals: FloatArray, f: int, u: float, v: float, found: FloatArray
 ) -> None:
-    """Place and unit normal of a point, into ``found`` (6,)."""
+    """Write position and unit normal of a point into ``found`` (6,)."""
     size = 0.0
     for a in range(3):
         found[a] = found[3 + a] = 0.0
@@ -228,7 +228,7 @@ def _described(
 
 @compiled
 def _cost(here: FloatArray, point: FloatArray, normal: FloatArray, per_metre: float, per_normal: float) -> float:
-    """Squared distances of places and of normals, in deviations."""
+    """Squared distances of positions and normals, in standard deviations."""
     cost = 0.0
     for a in range(3):
         cost += ((here[a] - point[a]) * per_metre) ** 2 + ((here[3 + a] - normal[a]) * per_normal) ** 2

@@ -1,9 +1,8 @@
-"""Reading body model files in SMPL's form: ``.npz``, and ``.pkl`` without running anything that is in it.
+"""Reading body model files in SMPL's form: ``.npz``, and ``.pkl`` without executing their content.
 
-A pickle is a program. The official SMPL files are pickles of Python 2 with numpy, scipy and chumpy objects. The reader
-here knows stand-ins for exactly these; a stand-in only keeps what it is given, and every other name is refused. It is
-the interpreter of the standard library that is written in Python: the one in C reserves as much memory as a file asks
-for.
+A pickle is a program. The official SMPL files are pickles of Python 2 with numpy, scipy and chumpy objects. This reader
+has stand-ins for exactly these objects; a stand-in only stores its arguments, and every other name is rejected. It uses
+the standard library's unpickler in Python: the one in C allocates as much memory as a file requests.
 """
 
 from __future__ import annotations
@@ -21,10 +20,10 @@ import numpy.typing as npt
 from body_tracking.core.errors import BodyTrackingError
 
 MAX_BYTES: Final = 1 << 30
-"""Of a file, and of an array in it: SMPL-X in full takes 600 MB as pickle, and 250 MB at most in one array."""
+"""Limit of a file, and of an array in it: full SMPL-X takes 600 MB as pickle, and 250 MB at most in one array."""
 WANTED: Final = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
 EXTRA: Final = ("joint_names", "frames")
-"""Of the project's own files: see :mod:`body_tracking.mesh.body_model`."""
+"""Arrays of the project's own files: see :mod:`body_tracking.mesh.body_model`."""
 
 
 class ModelFileError(BodyTrackingError):
@@ -32,10 +31,10 @@ class ModelFileError(BodyTrackingError):
 
 
 def read(path: Path) -> dict[str, npt.NDArray[Any]]:
-    """The arrays of a body model file by their names in SMPL's form, dense.
+    """The arrays of a body model file by their names in SMPL's form, as dense arrays.
 
     Raises:
-        ModelFileError: no such file, too large, not an archive or pickle of arrays, hostile, or an array missing.
+        ModelFileError: no such file, too large, not an archive or pickle of arrays, malicious, or an array missing.
     """
     try:
         size = path.stat().st_size
@@ -87,7 +86,7 @@ def _read_pickle(path: Path) -> dict[str, npt.NDArray[Any]]:
 
 
 class _StandIn:
-    """Keeps its arguments and state. ``kind`` says what it stands for."""
+    """Stores its arguments and state; ``kind`` names the replaced class."""
 
     __slots__ = ("arguments", "kind", "state")
 
@@ -118,7 +117,7 @@ _KINDS: Final = {
 
 
 class _Name:
-    """What a name in the pickle stands for; a call of it makes a stand-in."""
+    """Replacement of a global name in the pickle; a call returns a stand-in."""
 
     __slots__ = ("kind",)
 
@@ -143,7 +142,7 @@ class _Reader(pickle._Unpickler):
         raise ModelFileError("the pickle refers to a registered extension")
 
     def _new_object(self) -> None:
-        """``cls.__new__(cls, *arguments)``: the stand-in of the class instead."""
+        """``cls.__new__(cls, *arguments)``, replaced by a stand-in of the class."""
         stack = cast(Any, self).stack
         arguments = stack.pop()
         cls = stack.pop()
@@ -157,7 +156,7 @@ class _Reader(pickle._Unpickler):
 
 
 def _raw(value: object) -> bytes:
-    """Bytes; in a pickle of Python 2 they are text, in one of Python 3 with protocol 2 a call that encodes text."""
+    """Bytes: text in a pickle of Python 2, a call that encodes text in one of Python 3 with protocol 2."""
     if isinstance(value, _StandIn) and value.kind == "encode":
         value = value.arguments[0]
     return value if isinstance(value, bytes) else cast(str, value).encode("latin1")
@@ -174,7 +173,7 @@ def _dtype(value: _StandIn) -> np.dtype[Any]:
 
 
 def _as_array(value: Any, depth: int = 0) -> npt.NDArray[Any]:
-    """A dense array of what a stand-in was given."""
+    """A dense array from a stand-in's state."""
     if depth > 8:
         raise ModelFileError("arrays within arrays")
     if not isinstance(value, _StandIn):

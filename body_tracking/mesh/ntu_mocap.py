@@ -1,20 +1,21 @@
-"""Recordings of the NTU motion capture data set of Jatesiktat et al. (2018), section IV: one folder for each.
+"""Recordings of the NTU motion capture data set of Jatesiktat et al. (2018), section IV: one folder per recording.
 
-The format is documented by its authors (github.com/koonyook/mocap_dataset, mocapDataViewer). Of a recording's folder
-are read:
+The authors document the format (github.com/koonyook/mocap_dataset, mocapDataViewer). The reader uses these files of a
+recording's folder:
 
 - ``kinect/``: ``timestamp.bin`` (float64, ms), ``depthBuffer.bin`` (uint16, mm, 424x512 for each stamp),
   ``bodyIndexBuffer.bin`` (uint8, as many pixels; 255 for nobody), ``cameraIntrinsics.bin`` (7 float32: focal lengths,
-  principal point, three radial coefficients), ``depthToCameraSpaceTable.bin`` (float32, x and y of each pixel's ray,
-  which the intrinsics are checked with), ``OfflineBodyframe.protobuf`` (skeletons);
+  principal point, three radial coefficients), ``depthToCameraSpaceTable.bin`` (float32, x and y of each pixel's ray, to
+  check the intrinsics), ``OfflineBodyframe.protobuf`` (skeletons);
 - ``imu*/RawSample.RawSampleListProto``: counts of an LSM303D and an L3GD20, with stamps in the Kinect's clock, and
-  ``magCalibrationParameters.bin``; ``setting.SettingProto`` says which one is worn where;
-- ``vicon/viconRecord.TRC`` (markers, mm) and ``viconStartOffset.bin`` (float64, the Kinect's frame at which it starts).
+  ``magCalibrationParameters.bin``; ``setting.SettingProto`` maps sensors to segments;
+- ``vicon/viconRecord.TRC`` (markers, mm) and ``viconStartOffset.bin`` (float64, the Kinect's frame of the first
+markers).
 
-The SDK's images are mirrored: their columns follow its camera space, whose x points to the sensor's left. Here they run
-to the right, as in every optical frame.
+The SDK's images are mirrored: their columns follow its camera space, whose x points to the sensor's left. The reader
+flips them to the optical frame's direction.
 
-Stamps, depth images and intrinsics are required; what else is absent is named in the warnings.
+Stamps, depth images and intrinsics are required; warnings name other missing files.
 """
 
 from __future__ import annotations
@@ -51,16 +52,16 @@ _FORCE: Final = 0.00018 * STANDARD_GRAVITY
 _TESLA: Final = 0.080e-7
 """Tesla per count of the magnetometer: 0.08 milligauss."""
 _PLACES: Final = {1: "camera", 2: "forearm_left", 3: "forearm_right"}
-"""Where an inertial sensor is, by the field of ``SettingProto`` that has its number."""
+"""Segment of each inertial sensor, by the field of ``SettingProto`` with its number."""
 _TO_OPTICAL: Final = np.array([-1.0, -1.0, 1.0])
-"""From camera space (x to the sensor's left, y up) to the optical frame."""
+"""Factors from camera space (x to the sensor's left, y up) to the optical frame."""
 _OFF: Final = 2e-3
-"""Largest difference of a ray's x and y between intrinsics and table within the middle of the image: a pixel."""
+"""Largest difference between rays of the intrinsics and the table in the middle of the image (about a pixel)."""
 BAD: Final = "readings that no inertial sensor can have made"
 
 
 class NtuMocapError(BodyTrackingError):
-    """A folder that is no recording of the data set, or a file in it that is broken."""
+    """Raised for a folder that is not a recording of the data set, or a damaged file in it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +72,7 @@ class RecordedDepth:
         sensor: the camera's name.
         received_ns: nanoseconds of the Kinect's clock.
         depth: (424, 512) millimetres, 0 where missing.
-        bodies: (424, 512) number of the body, 255 for nobody; None where it is not recorded.
+        bodies: (424, 512) number of the body, 255 for nobody; None if not recorded.
         camera: intrinsics.
     """
 
@@ -101,20 +102,20 @@ def is_ntu_mocap(path: Path) -> bool:
 
 
 class NtuMocapRecording:
-    """The items of one recording, in the order of their times.
+    """Iterates over the items of one recording in the order of time.
 
     Args:
         path: its folder.
         sensor: name of the Kinect.
-        partial: read a recording that was cut off up to its last whole image, skeleton or reading.
+        partial: read a truncated recording up to its last whole image, skeleton or reading.
 
     Attributes:
         problems: counts of irregularities, by kind.
-        warnings: a line for each part that is missing.
-        progress: share that has been read, 0 to 1.
+        warnings: one line per missing part.
+        progress: share read, 0 to 1.
 
     Raises:
-        NtuMocapError: while iterating: a file is absent, broken, or does not belong to the others.
+        NtuMocapError: while iterating: a file is missing, damaged or inconsistent with the others.
         SensorNameError: an invalid name.
     """
 
@@ -177,7 +178,7 @@ class NtuMocapRecording:
             raise NtuMocapError(f"{self._path / _STAMPS}: {stamps[0]:g} to {stamps[-1]:g} are no milliseconds")
         return np.round(stamps * _MS).astype(np.int64)
 
-    # --- what a recording has
+    # --- parts of a recording
 
     def _images(self, stamps: NDArray[np.int64]) -> Iterator[RecordedDepth]:
         camera, pixels = self._camera(), HEIGHT * WIDTH
@@ -194,7 +195,7 @@ class NtuMocapRecording:
             yield RecordedDepth(self._sensor, int(stamps[count]), image, own, camera)
 
     def _frames(self, name: str, kind: str, count: int) -> NDArray[Any]:
-        """The pixels of all images, mapped into memory: hundreds of megabytes."""
+        """The pixels of all images, memory-mapped because of hundreds of megabytes."""
         file = self._path / name
         wanted = count * HEIGHT * WIDTH * np.dtype(kind).itemsize
         try:
@@ -212,7 +213,7 @@ class NtuMocapRecording:
         return np.memmap(file, np.dtype(kind), "r", shape=(size // np.dtype(kind).itemsize,))
 
     def _camera(self) -> Camera:
-        """The intrinsics, if they agree with the table of rays."""
+        """The intrinsics, checked against the table of rays."""
         fx, fy, cx, cy, second, fourth, sixth = self._numbers(_INTRINSICS, "<f4", 7).astype(np.float64).tolist()
         values = np.array([fx, fy, cx, cy, second, fourth, sixth])
         if not np.isfinite(values).all() or not 100.0 < fx < 1000.0 or not 100.0 < fy < 1000.0:
@@ -232,7 +233,7 @@ class NtuMocapRecording:
         return camera
 
     def _messages(self, data: bytes, name: str) -> Iterator[Fields]:
-        """The messages of a list, which is its field 1."""
+        """The messages in field 1 of a list."""
         try:
             parts = fields(data).get(1, [])
         except ProtobufError as error:

@@ -1,9 +1,9 @@
-"""The pixels of a person in a depth image, without a trained classifier.
+"""Segmentation of a person in a depth image without a trained classifier.
 
-Three cues, each of which may be missing: the still background is farther away, the floor lies below, and the person is
-near the mesh that the last frames predict. What is left falls apart into surfaces at jumps of depth; without a
-prediction the nearest one of a person's size is taken, and the smaller ones beside it. Furniture may be as large as a
-person: the next candidate can be asked for where the body model does not fit the first one.
+Three cues, each optional: the static background is farther away, the floor lies below, and the person is near the mesh
+predicted from the last frames. The remaining pixels are split into surfaces at depth jumps. Without a prediction, the
+nearest surface of a person's size is taken, with the smaller ones beside it. Furniture may have a person's size: the
+caller can ask for the next candidate if the body model does not fit.
 """
 
 from __future__ import annotations
@@ -20,30 +20,31 @@ from body_tracking.core.skeleton import BoolArray, FloatArray, SingleArray
 from body_tracking.mesh.depth import DepthCamera
 
 _CLEARANCE: Final = 0.05
-"""Metres by which a person is nearer than the background, or above the floor; 12 standard deviations at 4.8 m."""
+"""Least distance of a person from the background or above the floor, metres; 12 standard deviations at 4.8 m."""
 _REVEALED, _SMALL, _ABSORBED = 3, 30, 300
-"""Frames after which a farther surface becomes a pixel's background, a small one, and what may be a person."""
+"""Frames until a surface becomes background: a farther one, a small one, and one that may be a person."""
 _GRAZING: Final = 5.7
-"""Largest slope of a surface against the image plane: 80 degrees. Steeper than that are jumps between surfaces."""
+"""Largest slope of a surface against the image plane, 80 degrees; steeper steps are jumps between surfaces."""
 REACH: Final = 0.25
-"""Metres about the predicted mesh in which the person is looked for: 7.5 m/s at 30 Hz."""
+"""Metres around the predicted mesh within which the person is searched for: 7.5 m/s at 30 Hz."""
 _PERSON_AREA: Final = (0.12, 1.6)
-"""Square metres that the camera sees of a person: of a child from the side, and of a large man with his arms out."""
+"""Visible area of a person, square metres: from a child from the side to a large man with his arms out."""
 _TRACKED_AREA: Final = 0.05
-"""The same of a person who is tracked: 0.08 from the side, from the head to the elbows."""
+"""Least visible area of a tracked person, square metres: 0.08 from the side, from the head to the elbows."""
 _PERSON_EXTENT: Final = (0.45, 2.3)
-"""Metres of the longest side of the box about a person."""
+"""Longest side of the box around a person, metres."""
 _ATTACHED: Final = 0.3
-"""Share of a surface's boundary that goes over into known background from which on it is background too: the wall that
-an arm has hidden so far."""
+"""Share of a surface's boundary in contact with known background, above which the surface is background: e.g. wall that
+an arm has hidden."""
 _LEAST_AREA: Final = 0.0015
-"""Square metres of a surface that is more than noise: a part of a hand."""
+"""Least area of a surface that is not noise, square metres: a part of a hand."""
 _FRAGMENT: Final = 0.15
-"""Metres from the box about a person within which smaller surfaces are the person's own, as a hand before the chest."""
+"""Metres around a person's box within which smaller surfaces belong to the person, e.g. a hand in front of the
+chest."""
 _HEAD: Final = 0.3
-"""The same upwards in the image: the chin may cut the head off from the trunk."""
+"""Upward margin of that box, metres: a depth jump at the chin may separate the head from the trunk."""
 _COVERED: Final = 0.02
-"""Share of pixels with a distance below which a lens is covered."""
+"""Share of pixels with a measured distance, below which the lens counts as covered."""
 
 COVERED = "hardly any pixel has a distance: is the lens covered?"
 NOBODY = "nobody is seen"
@@ -51,11 +52,11 @@ NOBODY = "nobody is seen"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Floor:
-    """A plane; ``up . point + height`` is the height of a point above it.
+    """A floor plane; ``up . point + height`` is the height of a point above it.
 
     Attributes:
         up: (3,) unit normal in the optical frame.
-        height: metres of the camera above it.
+        height: of the camera above the floor, metres.
     """
 
     up: FloatArray
@@ -68,8 +69,8 @@ class Found:
 
     Attributes:
         mask: (height, width) pixels of the person.
-        people: how many surfaces of a person's size there are; 1 with a prediction, where the person is seen.
-        reason: why the mask is empty; "" where it is not.
+        people: number of surfaces of a person's size; with a prediction 1 if the person is visible, else 0.
+        reason: why the mask is empty; "" if it is not.
     """
 
     mask: BoolArray
@@ -78,11 +79,11 @@ class Found:
 
 
 class PersonFinder:
-    """Finds the pixels of one person in the images of a camera that stands still.
+    """Segments one person in the images of a stationary camera.
 
     Args:
         view: the camera.
-        floor: its floor where known; else it is looked for in the first images.
+        floor: the floor if known; else it is estimated from the first images.
     """
 
     def __init__(self, view: DepthCamera, floor: Floor | None = None) -> None:
@@ -90,7 +91,7 @@ class PersonFinder:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the background, as after a backward jump of time or where the camera was moved."""
+        """Forget the background, e.g. after a backward jump of time or when the camera was moved."""
         shape = self._view.camera.height, self._view.camera.width
         self._background: SingleArray = np.zeros(shape, np.float32)
         self._other: SingleArray = np.zeros(shape, np.float32)
@@ -99,14 +100,13 @@ class PersonFinder:
         self._looks = 0
 
     def find(self, depth: SingleArray, predicted: FloatArray | None = None, choice: int = 0) -> Found:
-        """The person in an image; learns the background from the rest.
+        """Segment the person in an image, and learn the background from the rest.
 
         Args:
             depth: (height, width) metres, 0 where missing.
-            predicted: (n, 3) vertices where the person is expected, metres in the optical frame; None where nobody was
-                tracked.
-            choice: without a prediction, which of the surfaces of a person's size to take, the nearest first; counted
-                on from the first one after the last.
+            predicted: (n, 3) predicted vertices, metres in the optical frame; None if nobody was tracked.
+            choice: without a prediction, rank of the surface to take among those of a person's size, the nearest first;
+                wraps around after the last one.
 
         Raises:
             DepthError: another size than the camera's.
@@ -139,20 +139,20 @@ class PersonFinder:
 
 
 def is_covered(depth: SingleArray) -> bool:
-    """Whether hardly any pixel of an image has a distance."""
+    """Whether hardly any pixel of an image has a measured distance."""
     return bool(np.count_nonzero(depth) < _COVERED * depth.size)
 
 
 def _person_among(
     areas: FloatArray, boxes: FloatArray, chosen: BoolArray, choice: int
 ) -> tuple[BoolArray, BoolArray, int]:
-    """The surfaces of one person, of all that may be people, and the number of these.
+    """Masks (S,) of one person's surfaces and of all surfaces of people, and the number of people.
 
     Args:
         areas: (S,) square metres of the surfaces.
-        boxes: (S, 2, 3) corners of the boxes about them.
+        boxes: (S, 2, 3) corners of their bounding boxes, metres.
         chosen: (S,) surfaces that may belong to a person.
-        choice: which person, the nearest first.
+        choice: rank of the person, the nearest first.
     """
     longest = (boxes[:, 1] - boxes[:, 0]).max(axis=1, initial=0.0)
     alike = chosen & (areas > _PERSON_AREA[0]) & (areas < _PERSON_AREA[1])
@@ -168,16 +168,16 @@ def _person_among(
 
 
 def find_floor(view: DepthCamera, depth: SingleArray, tilt: float = 0.7, tolerance: float = 0.02) -> Floor | None:
-    """The largest plane that faces upwards and has nothing below it; None where there is none.
+    """The largest upward plane with nothing below it; None if there is none.
 
-    Random sample consensus (Fischler and Bolles 1981) over 200 triples of the lower half of the image, with a fixed
-    generator; then a least-squares plane through its points.
+    Random sample consensus (Fischler and Bolles 1981) over 200 triples of points from the lower half of the image, with
+    a fixed seed; then a least-squares plane through its inliers.
 
     Args:
-        view: the camera, upright within ``tilt``.
+        view: the camera, level within ``tilt``.
         depth: (height, width) metres, 0 where missing.
         tilt: largest angle between the plane's normal and the image's upward direction, radians.
-        tolerance: largest distance of a point of the plane, metres.
+        tolerance: largest distance of an inlier, metres.
     """
     points = view.points(depth)[depth.shape[0] // 2 :: 2, ::16].reshape(-1, 3).astype(np.float64)
     points = points[np.isfinite(points).all(axis=1)]
@@ -199,7 +199,7 @@ def find_floor(view: DepthCamera, depth: SingleArray, tilt: float = 0.7, toleran
         return None
     distances = heights[:, np.argmax(on)]
     for within in (tolerance, 0.6 * tolerance):
-        # ever closer, as a wall's lowest points are near the floor too
+        # the second round is stricter, because the lowest points of walls are near the floor too
         chosen = points[np.abs(distances) < within]
         middle = chosen.mean(axis=0)
         up = np.linalg.svd(chosen - middle, full_matrices=False)[2][2]
@@ -209,10 +209,10 @@ def find_floor(view: DepthCamera, depth: SingleArray, tilt: float = 0.7, toleran
 
 
 def near(vertices: FloatArray, depth: SingleArray, camera: Camera, reach: float) -> BoolArray:
-    """(height, width) pixels whose points are within about ``reach`` metres of a mesh.
+    """(height, width) mask of pixels whose points are within about ``reach`` metres of a mesh.
 
-    On every fourth pixel a box of ``reach`` about each vertex spans an interval of distances; a pixel is near where its
-    distance lies in the interval.
+    On a grid of every fourth pixel, a box of ``reach`` around each vertex spans an interval of distances; a pixel is
+    near if its distance lies within the interval.
     """
     with np.errstate(invalid="ignore"):
         pixels = camera.project(vertices)
@@ -246,7 +246,7 @@ def _near(pixels: FloatArray, distances: FloatArray, depth: SingleArray, reach: 
 def _candidates(
     depth: SingleArray, rays: SingleArray, background: SingleArray, up: FloatArray, height: float, clearance: float
 ) -> BoolArray:
-    """Pixels nearer than the background, or without one, and above the floor."""
+    """Mask of pixels above the floor and nearer than the background, or without known background."""
     rows, columns = depth.shape
     found = np.zeros((rows, columns), dtype=np.bool_)
     for i in range(rows):
@@ -272,8 +272,8 @@ def _learn(
 ) -> None:
     """Update the background of each pixel, in place.
 
-    Another surface than the background replaces it after it has stayed for ``revealed`` frames where it is farther,
-    else for as many as ``patience`` says of its label; never for 0. ``other`` is its distance, ``stays`` counts frames.
+    A surface other than the background replaces it after ``revealed`` frames if it is farther, else after ``patience``
+    frames of its label; never for 0. ``other`` is its distance, ``stays`` the number of frames.
     """
     rows, columns = depth.shape
     for i in range(rows):
@@ -297,9 +297,9 @@ def _learn(
 
 @compiled
 def _surfaces(depth: SingleArray, candidates: BoolArray, jump: float) -> tuple[NDArray[np.int32], int]:
-    """Connected surfaces on every second pixel, by union-find: labels (height, width) from 1 on, and their number.
+    """Connected surfaces on every second pixel, by union-find: labels (height, width) from 1, and their number.
 
-    A candidate between these pixels takes the label of the first of the four around it on whose surface it is.
+    A candidate between these pixels takes the label of the first of four grid pixels around it on the same surface.
     """
     height, width = depth.shape
     rows, columns = height // 2, width // 2
@@ -367,14 +367,14 @@ def _measure(
     background: SingleArray,
     clearance: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Area in square metres (count,), the corners (count, 2, 3) of the box about each surface, and what share of its
-    boundary (count,) goes over into known background.
+    """Area in square metres (count,), corners (count, 2, 3) of each surface's bounding box, and share (count,) of its
+    boundary in contact with known background.
     """
     areas, edges, contacts = np.zeros(count), np.zeros(count), np.zeros(count)
     boxes = np.zeros((count, 2, 3))
     boxes[:, 0], boxes[:, 1] = np.inf, -np.inf
     height, width = depth.shape
-    # rays of neighbours: one over the focal length
+    # ray difference between neighbouring pixels: one over the focal length
     across = abs(rays[height // 2, width // 2, 0] - rays[height // 2, width // 2 - 1, 0])
     down = abs(rays[height // 2, width // 2, 1] - rays[height // 2 - 1, width // 2, 1])
     point = np.zeros(3)

@@ -1,9 +1,9 @@
-"""The shape of one person from depth images of several poses.
+"""Estimation of a person's body shape from depth images in several poses.
 
-Jatesiktat (2018), III: a rough shape from the lengths that another skeleton shows (eq. 18), then shape and pose
-together. The paper takes one image; one in four of its starts ends in a wrong shape, and shoulder width is 28 mm off.
-Here all images are fitted jointly: they share the shape, each has its own pose, and the normal equations are an
-arrowhead whose blocks of poses are eliminated (Schur complement).
+Jatesiktat (2018), III: a rough shape from the segment lengths of another skeleton (eq. 18), then shape and pose
+together. The paper uses one image; one in four of its starts ends in a wrong shape, and the shoulder width is 28 mm
+off. Here all images are fitted jointly: they share the shape, each has its own pose, and the Schur complement
+eliminates the poses' blocks of the arrowhead-shaped normal equations.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from body_tracking.mesh.uncertainty import joint_shape_gradients, point_shape_gr
 SCALES: Final = (0.1, 0.1, 0.06, 0.06, 0.03, 0.03, 0.03, 0.03)
 """Metres: robust scale of each joint step."""
 STATURES: Final = (-1.2, 0.0, 1.2)
-"""Starts of the first shape component, which is the stature."""
+"""Initial values of the first shape component, the stature."""
 
 
 class PersonalisationError(BodyTrackingError):
-    """The images do not show one person well enough for a shape."""
+    """Raised if the images do not show one person well enough to estimate a shape."""
 
 
 APART: Final = 0.25
-"""Radians, root mean square over the arms' and the trunk's joints, from which on two poses are different ones."""
+"""Radians, root mean square over the joints of arms and trunk: smallest difference between distinct poses."""
 _MOVING: Final = ("shoulder", "elbow", "spine1", "spine2", "spine3")
 
 
@@ -43,11 +43,11 @@ class DistinctPoses:
 
     Args:
         model: shape space.
-        count: observations that are needed.
+        count: number of observations needed.
 
     Attributes:
-        observations: so far.
-        poses: in which the person was fitted.
+        observations: kept so far.
+        poses: fitted pose of each observation.
     """
 
     def __init__(self, model: BodyModel, count: int) -> None:
@@ -58,11 +58,11 @@ class DistinctPoses:
 
     @property
     def complete(self) -> bool:
-        """Whether these are enough."""
+        """Whether there are enough observations."""
         return len(self.poses) >= self._count
 
     def offer(self, observation: Observation, pose: Pose) -> None:
-        """Keep an observation if its pose differs from all that were kept."""
+        """Keep an observation if its pose differs from all poses kept."""
         own = pose.rotations[self._joints]
         for other in self.poses:
             angles = np.linalg.norm(so3.rotation_vectors(other.rotations[self._joints].mT @ own), axis=1)
@@ -94,16 +94,16 @@ def personalise(
     starts: Sequence[Pose] | None = None,
     settings: Settings | None = None,
 ) -> Person:
-    """The shape of the person that all images show (Jatesiktat 2018, figure 2 and section III-B, from several images).
+    """Estimate the shape of the person in all images (Jatesiktat 2018, figure 2 and section III-B, on several images).
 
     Args:
         model: shape space.
-        observations: of 4 to 8 images in different poses; fewer leave the shape to the prior.
-        starts: pose of each; without them, they are searched.
-        settings: deviations of the terms.
+        observations: of 4 to 8 images in different poses; with fewer the prior dominates the shape.
+        starts: initial pose of each; None to search for them.
+        settings: standard deviations of the terms.
 
     Raises:
-        PersonalisationError: no image, or the person is lost in more than half of them.
+        PersonalisationError: no image, or the fit is lost in more than half of them.
     """
     if not observations:
         raise PersonalisationError("no image to personalise from")
@@ -134,7 +134,7 @@ def _refined(
     shape = fitter.body.shape
     for scale in SCALES:
         systems = [_system(fitter, seen, pose, scale) for seen, pose in zip(observations, poses, strict=True)]
-        information = np.eye(len(shape))  # the prior: components are in standard deviations
+        information = np.eye(len(shape))  # prior: components are in standard deviations
         gradient = shape.copy()
         for each in systems:
             information += each.shape - each.mixed.T @ each.solved
@@ -155,7 +155,9 @@ def _bounded(step: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _FrameSystem:
-    """One image's normal equations, its pose eliminated: ``mixed`` is (pose, shape), ``solved`` its solution."""
+    """Normal equations of one image: ``mixed`` is (pose, shape); ``solved`` is the inverse pose block times
+    ``mixed``.
+    """
 
     fit: Fit
     shape: FloatArray

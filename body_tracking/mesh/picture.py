@@ -1,4 +1,4 @@
-"""The fitted mesh over the depth image that it was fitted to: shaded over grey, and its outline over false colours."""
+"""Overlay of the fitted mesh on its depth image: shaded over grey, or its outline over false colours."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from body_tracking.core.skeleton import FloatArray, SingleArray
 from body_tracking.mesh.raster import render
 
 _NEAR, _FAR = 0.5, 5.0
-"""Metres between which the image goes from white to black, or from red to blue."""
+"""Metres: range of the colour scale, from white to black or from red to blue."""
 _SKIN: Final = np.array([255.0, 170.0, 90.0])
 """Red, green, blue of the mesh where it faces the camera."""
 _OPAQUE: Final = 0.6
 _MISSING: Final = (30, 30, 30)
-"""Red, green, blue where nothing was measured, in false colours."""
+"""Red, green, blue of missing depth, in false colours."""
 _OUTLINE: Final = (255, 255, 255)
 
 
@@ -26,15 +26,15 @@ def overlay(depth: SingleArray, corners: FloatArray, camera: Camera) -> NDArray[
     """The mesh, transparent and shaded, over the depth image in grey.
 
     Args:
-        depth: (height, width) metres, 0 where missing, which is drawn dark blue.
+        depth: (height, width) metres, 0 where missing, drawn dark blue.
         corners: (F, 3, 3) triangles, metres in the camera's optical frame.
-        camera: whose image it is.
+        camera: the image's camera.
 
     Returns:
         (height, width, 3) red, green, blue.
     """
     if len(corners) == 0:
-        corners = np.zeros((1, 3, 3))  # behind the camera: nothing of it is drawn
+        corners = np.zeros((1, 3, 3))  # a degenerate triangle at the camera, which is not drawn
     grey = 255.0 * np.clip((_FAR - depth) / (_FAR - _NEAR), 0.0, 1.0)
     image = np.where((depth > 0.0)[..., None], grey[..., None], [20.0, 20.0, 60.0])
     seen = _seen(corners, camera)
@@ -51,13 +51,13 @@ def outlined(depth: SingleArray, corners: FloatArray, camera: Camera | None, wid
     """The depth image in false colours, red near and blue far, with the outline of the mesh.
 
     Args:
-        depth: (height, width) metres, 0 where missing, which is drawn dark.
+        depth: (height, width) metres, 0 where missing, drawn dark.
         corners: (F, 3, 3) triangles, metres in the camera's optical frame; none for the bare image.
-        camera: whose image it is; None where its calibration is not known, for the bare image.
+        camera: the image's camera; None if its calibration is unknown, for the bare image.
         width: of the result, pixels.
 
     Returns:
-        (_, width, 3) red, green, blue.
+        (height, width, 3) red, green, blue; the aspect ratio is kept.
     """
     nearness = np.asarray(255.0 * np.clip((_FAR - depth) / (_FAR - _NEAR), 0.0, 1.0), np.uint8)
     image = cv2.applyColorMap(nearness, cv2.COLORMAP_TURBO)[..., ::-1].copy()
@@ -74,5 +74,5 @@ def outlined(depth: SingleArray, corners: FloatArray, camera: Camera | None, wid
 
 
 def _seen(corners: FloatArray, camera: Camera) -> NDArray[np.int32]:
-    """(height, width) number of the triangle that is seen; -1 for none."""
+    """(height, width) index of the visible triangle; -1 for none."""
     return render(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), camera).faces

@@ -1,4 +1,4 @@
-"""A depth buffer: what a depth camera would measure of a mesh."""
+"""A depth buffer: ideal depth image of a mesh."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ FaceArray = NDArray[np.int32]
 
 
 _BEYOND = 1.2
-"""Tangent of the angle from the optical axis up to which the distortion's polynomials are used, over the corners'."""
+"""Factor on the image corners' tangent from the optical axis, up to which the distortion's polynomials are valid."""
 
 
 class DepthBuffer(NamedTuple):
     """A rendered mesh.
 
     Attributes:
-        depth: (height, width) float32 metres along the optical axis, 0 where no face is seen.
-        faces: (height, width) int32 number of the face that is seen; -1 for none.
+        depth: (height, width) float32 metres along the optical axis, 0 without a face.
+        faces: (height, width) int32 index of the visible face; -1 for none.
     """
 
     depth: SingleArray
@@ -33,15 +33,16 @@ class DepthBuffer(NamedTuple):
 def render(vertices: FloatArray, faces: NDArray[np.integer], camera: Camera, scale: int = 1) -> DepthBuffer:
     """Render a mesh by a z-buffer, both sides of its faces.
 
-    Lens distortion moves the vertices; the edges between them stay straight, which is exact enough for faces of
-    centimetres. A face with a vertex less than 1 cm in front of the camera is left out, and with distortion one with a
-    vertex so far outside of the image that the distortion is not known there.
+    Lens distortion moves the vertices; the edges stay straight, which is exact enough for faces of centimetres. Faces
+    with a vertex less than 1 cm in front of the camera are skipped, with distortion also faces with a vertex so far
+    outside the image that the distortion is unknown there.
 
     Args:
         vertices: (n, 3) metres in the optical frame.
-        faces: (m, 3) numbers of vertices.
-        camera: whose image it is.
-        scale: pixels of the camera per pixel of the buffer, whose centres lie in the middle of theirs.
+        faces: (m, 3) vertex indices.
+        camera: the image's camera.
+        scale: pixels of the camera per pixel of the buffer, along each axis; the centres of a buffer pixel and of its
+            block of camera pixels coincide.
     """
     pixels = (camera.project(vertices) + 0.5) / scale - 0.5
     if camera.distortion.any():
@@ -58,12 +59,14 @@ def render(vertices: FloatArray, faces: NDArray[np.integer], camera: Camera, sca
 def _fill(
     pixels: FloatArray, distances: FloatArray, faces: FaceArray, height: int, width: int
 ) -> tuple[SingleArray, FaceArray]:
-    """1/z is linear in the image; it is interpolated with the signed areas opposite to the vertices."""
+    """Depth and visible faces; 1/z is linear in the image and interpolated by the signed areas opposite the
+    vertices.
+    """
     nearness = np.zeros((height, width), dtype=np.float64)
     seen = np.full((height, width), -1, dtype=np.int32)
     for k in range(len(faces)):
         a, b, c = faces[k, 0], faces[k, 1], faces[k, 2]
-        # not greater: NaN too, which a vertex behind the camera or beyond the distortion's range projects to
+        # false for NaN too, the projection of a vertex behind the camera or beyond the distortion's range
         if not (distances[a] > 0.01 and distances[b] > 0.01 and distances[c] > 0.01):
             continue
         xa, ya, xb, yb, xc, yc = pixels[a, 0], pixels[a, 1], pixels[b, 0], pixels[b, 1], pixels[c, 0], pixels[c, 1]

@@ -16,19 +16,19 @@ from body_tracking.mesh.solver import Orientation
 from body_tracking.mesh.topics import JOINTS_OF
 
 NEAREST_NS: Final = NANOSECONDS // 20
-"""Greatest difference between the stamps of an image and of an orientation that is used with it."""
+"""Largest difference between the stamps of an image and an orientation used with it."""
 _KEPT: Final = 64
-"""Orientations per segment that wait for their image: a second at the usual 60 Hz."""
+"""Number of orientations kept per segment: a second at the usual 60 Hz."""
 _FRAMES: Final = np.radians(4.0)
-"""Radians per axis by which the frame of a person's segment differs from that of the mesh: their joints' centres, and
-the turn at which a forearm counts as neutral, are defined differently."""
+"""Radians per axis: standard deviation between the anatomical frames of a person's segment and of the mesh; their joint
+centres and the forearm's neutral rotation are defined differently."""
 
 
 class SensorOrientations:
-    """The latest orientations of segments, in ``world`` and the reference's clock.
+    """Latest orientations of segments, in the frame ``world`` and the reference's clock.
 
     Args:
-        segments: that carry a sensor.
+        segments: with an inertial sensor.
 
     Raises:
         OrientationError: the mesh has no such segment.
@@ -45,25 +45,25 @@ class SensorOrientations:
         return bool(self._latest)
 
     def add(self, measurement: SegmentOrientation) -> None:
-        """Keep one for the images near its time."""
+        """Keep an orientation for images near its time."""
         self._latest[measurement.segment].append(measurement)
 
     def forget(self, segment: str) -> None:
-        """Drop those of a segment, whose stamps jumped back."""
+        """Drop the orientations of a segment after a backward jump of its stamps."""
         self._latest[segment].clear()
 
     def seen_from(
         self, placement: Placement, stamp_ns: int, names: Sequence[str], counters: Counter[str]
     ) -> list[Orientation]:
-        """The orientations at the time of an image, in the camera's optical frame.
+        """The orientations at an image's time, in the camera's optical frame.
 
-        Each is the nearest one within 50 ms, turned on to the image's stamp by its angular velocity.
+        Each is the nearest one within 50 ms, extrapolated to the image's stamp by its angular velocity.
 
         Args:
             placement: pose and clock of the camera.
             stamp_ns: of the image, in the camera's clock.
-            names: of the joints of the mesh.
-            counters: of images for which an orientation cannot be used.
+            names: of the mesh's joints.
+            counters: of images without a usable orientation.
         """
         if not self._latest:
             return []

@@ -1,8 +1,8 @@
-"""A simulated Kinect v2: the depth that it measures of a scene whose depth is known.
+"""A simulated Kinect v2: depth images with realistic errors from a scene's true depth.
 
 Errors as measured on real frames (``../shared/data/kinect_depth``): axial noise that grows with the distance and at
-grazing angles, steps of 1 mm, missing pixels where little light returns (corners of the image, grazing and dark
-surfaces, outlines), flying pixels between foreground and background, and multipath in the corner above the floor.
+grazing angles, steps of 1 mm, missing pixels where little light returns (image corners, grazing and dark surfaces,
+outlines), flying pixels between foreground and background, and multipath in the corner above the floor.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from body_tracking.mesh.person import Floor
 
 @dataclass(frozen=True, slots=True)
 class DepthErrors:
-    """How much a simulated depth camera errs.
+    """Sizes of the errors of a simulated depth camera.
 
     Attributes:
-        noise: factor of the axial noise, :func:`~body_tracking.mesh.depth.axial_noise`.
+        noise: factor on the axial noise, :func:`~body_tracking.mesh.depth.axial_noise`.
         grazing: growth of the noise with the slope of a surface: 1 + grazing tan(angle of incidence).
-        dark: factor of the noise on dark cloth.
-        dark_bias: metres by which dark cloth seems farther away.
-        dark_holes: share of dark pixels that are missing.
-        outline_holes: share of pixels within 2 pixels of an outline that are missing.
-        corner_holes: share of pixels that are missing in the corners of the image, where the lamp is weak.
+        dark: factor on the noise on dark cloth.
+        dark_bias: positive bias of the depth of dark cloth, metres.
+        dark_holes: share of missing dark pixels.
+        outline_holes: share of missing pixels within 2 pixels of an outline.
+        corner_holes: share of missing pixels in the corners of the image, where the lamp is weak.
         lit: distance from the image's centre, in halves of its sides, up to which the lamp is strong enough.
         flying: share of the pixels beside an outline that lie between foreground and background.
-        jump: metres between neighbours from which on they are on both sides of an outline.
-        multipath: metres by which a surface in the corner above the floor seems farther away.
-        multipath_height: metres above the floor in which that falls to a third.
-        step: metres of the depth's resolution.
-        farthest: metres beyond which nothing is measured.
+        jump: least depth difference between neighbours across an outline, metres.
+        multipath: positive bias of the depth of a surface in the corner above the floor, metres.
+        multipath_height: height above the floor in which this bias falls to 1/e, metres.
+        step: resolution of the depth, metres.
+        farthest: largest measured distance, metres.
     """
 
     noise: float = 1.0
@@ -67,15 +67,15 @@ def measured(
     dark: BoolArray | None = None,
     floor: Floor | None = None,
 ) -> NDArray[np.uint16]:
-    """The image that the sensor gives.
+    """Simulate the sensor's depth image.
 
     Args:
-        depth: (height, width) true distances along the optical axis, metres; 0 where nothing is.
+        depth: (height, width) true distances along the optical axis, metres; 0 where empty.
         view: the camera.
-        rng: of the errors.
-        errors: how much it errs.
-        dark: (height, width) pixels of dark cloth.
-        floor: of the multipath; none without it.
+        rng: for the errors.
+        errors: sizes of the errors.
+        dark: (height, width) mask of dark cloth.
+        floor: for multipath; None for no multipath.
 
     Returns:
         (height, width) millimetres, 0 where missing, as ``16UC1``.
@@ -91,18 +91,18 @@ def measured(
     empty = np.where(there, true, own.farthest)
     block = np.ones((3, 3), np.uint8)
     near, far = (np.asarray(of(empty, block)) for of in (cv2.erode, cv2.dilate))
-    # a surface at 80 degrees falls away by 5.7 pixels for each pixel
+    # depth changes by up to 2 * 5.7 pixel widths across a 3 x 3 block of a surface at 80 degrees
     edge = far - near > np.maximum(own.jump, 2.0 * 5.7 / view.camera.matrix[0, 0] * near)
     slope = np.where(edge, 0.0, _slopes(np.log(empty), view.rays, *np.diagonal(view.camera.matrix)[:2]))
     sigma = own.noise * axial_noise(true) * (1.0 + own.grazing * slope) * np.where(dark, own.dark, 1.0)
     seen = true + own.dark_bias * dark + sigma * rng.standard_normal(shape)
     if floor is not None:
         above = np.maximum(true * (view.rays @ floor.up[:2] + floor.up[2]) + floor.height, 0.0)
-        # the floor itself is lit by nothing but the lamp; its neighbours are lit by it
+        # light from the floor reaches surfaces above it, not the floor itself
         seen += own.multipath * np.exp(-above / own.multipath_height) * (above > 0.02)
     flies = edge & there & (rng.random(shape) < own.flying) & (far < own.farthest)
     seen = np.where(flies, near + rng.random(shape) * (far - near), seen)
-    # holes come in patches of pixels whose light is too weak together; these have a standard normal distribution
+    # holes are patches of neighbouring pixels: a smoothed standard normal field is thresholded
     patches = gaussian_filter(rng.standard_normal(shape), 1.0)
     patches /= patches.std()
     missing = (cv2.dilate(edge.astype(np.uint8), block) > 0) & (patches < ndtri(own.outline_holes))
@@ -125,7 +125,7 @@ def _slopes(logs: FloatArray, rays: SingleArray, fx: float, fy: float) -> FloatA
 
     Args:
         logs: (height, width) of the distances.
-        rays: (height, width, 2) x and y; the slope is that of a surface that faces the camera where they are NaN.
+        rays: (height, width, 2) x and y; where they are NaN, the result is 0, as for a surface facing the camera.
         fx: focal length, pixels, with ``fy``.
         fy: see ``fx``.
     """

@@ -1,10 +1,10 @@
 """Linear blend skinning and its analytic derivative.
 
-A pose is a rotation per joint relative to its parent and a translation. A small rotation is applied on the right,
-``R_j exp(v)``, as everywhere in the project. The derivative of a surface point x by a rotation w of joint j about
-axes of the camera is ``w x S_j(x)``, ``S_j = sum over the joints k below j of w_k (x_k - p_j)``, where x_k is the point
-as bone k alone would carry it, and p_j the joint. Loper et al., "SMPL: a skinned multi-person linear model" (2015),
-eq. 2-4.
+A pose is a rotation per joint relative to its parent, and a translation. A small rotation v is applied on the right,
+``R_j exp(v)``, as everywhere in the project. The derivative of a surface point x by a rotation w of joint j about the
+camera's axes is ``w x S_j(x)``, ``S_j = sum over the joints k below j of w_k (x_k - p_j)``, w_k the skinning weight and
+x_k the position of the point if rigidly attached to bone k, p_j the joint's position. Loper et al., "SMPL: a skinned
+multi-person linear model" (2015), eq. 2-4.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ def forward_kinematics(
     """Orientations (J, 3, 3) and positions (J, 3) of the joints, metres.
 
     Args:
-        parents: (J,) index of each joint's parent, before it; -1 for the first.
+        parents: (J,) index of each joint's parent, which comes before it; -1 for the first.
         joints: (J, 3) metres, at rest.
         rotations: (J, 3, 3) relative to the parent.
-        translation: (3,) metres, of the first joint from its place at rest.
+        translation: (3,) metres: displacement of the first joint from its position at rest.
     """
     count = len(parents)
     turned = np.empty((count, 3, 3))
@@ -60,11 +60,11 @@ def skin(
 
     Args:
         vertices: (N, 3) at rest.
-        bones: (N, K) joints that carry each vertex.
-        weights: (N, K) their weights, 0 where there are fewer.
+        bones: (N, K) joints that move each vertex.
+        weights: (N, K) their weights, 0 in unused columns.
         joints: (J, 3) at rest.
-        turned: (J, 3, 3) of :func:`forward_kinematics`.
-        placed: (J, 3) of :func:`forward_kinematics`.
+        turned: (J, 3, 3) from :func:`forward_kinematics`.
+        placed: (J, 3) from :func:`forward_kinematics`.
     """
     posed = np.zeros_like(vertices)
     for n in range(len(vertices)):
@@ -81,7 +81,7 @@ def skin(
 
 @compiled
 def vertex_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """Unit normals (N, 3): the sum of the normals of the faces around, weighted by area; zero without faces."""
+    """Unit normals (N, 3): area-weighted mean of the adjacent faces' normals; zero without faces."""
     normals = np.zeros_like(vertices)
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
@@ -114,15 +114,15 @@ def lever_arms(
     """(P, J, 3) metres: S_j of points on the surface, zero where joint j does not move the point.
 
     Args:
-        corners: (P, C) vertices that carry each point.
+        corners: (P, C) vertices that define each point.
         shares: (P, C) their barycentric coordinates.
         vertices: (N, 3) at rest.
         bones: (N, K), with ``weights`` (N, K), as in :func:`skin`.
         weights: see ``bones``.
         parents: (J,).
         joints: (J, 3) at rest.
-        turned: (J, 3, 3) of :func:`forward_kinematics`.
-        placed: (J, 3) of :func:`forward_kinematics`.
+        turned: (J, 3, 3) from :func:`forward_kinematics`.
+        placed: (J, 3) from :func:`forward_kinematics`.
     """
     arms = np.zeros((len(corners), len(parents), 3))
     for n in range(len(corners)):

@@ -1,10 +1,10 @@
-"""Fit of a pose to one depth image by Levenberg-Marquardt.
+"""Levenberg-Marquardt fit of a pose to one depth image.
 
-Jatesiktat (2018), II-E and II-F, with these differences: correspondences are searched again in every step instead of
-being variables of their own, residuals are robust (Geman and McClure 1985) with a scale that falls from step to step,
-and the energy is a negative log-likelihood, so that its curvature is the inverse covariance of the pose.
+Differences from Jatesiktat (2018), II-E and II-F: correspondences are searched again in every step instead of being
+variables, residuals are robust (Geman and McClure 1985) with a decreasing scale, and the energy is a negative
+log-likelihood, so that its curvature is the inverse covariance of the pose.
 
-Over 500 lines: a fit, the terms that it adds up, and where it starts share the body and its anatomy.
+Over 500 lines: the fit, its terms and its starts share the body and its anatomy.
 """
 
 from __future__ import annotations
@@ -24,47 +24,47 @@ from body_tracking.mesh.energy import Matches, Observation
 from body_tracking.mesh.skinning import lever_arms, vertex_normals
 
 SCALES: Final = (0.05, 0.05)
-"""Metres: robust scale of each step where the person was where they were expected."""
+"""Metres: robust scale of each step from a predicted pose."""
 WIDE: Final = (0.2, 0.2, 0.2, 0.06, 0.06, 0.03, 0.03)
-"""Metres: the same from a rough start."""
+"""Metres: robust scale of each step from a rough start."""
 MATCHED: Final = 0.06
-"""Metres within which a measured point belongs to the body: clothes, shape and a few times the noise."""
+"""Metres: largest distance of a measured point from the body that explains it: clothes, shape and some noise."""
 AGAIN: Final = 0.03
-"""Share of the information of ordinary postures that counts for a hidden limb beside a prediction, which has that of
-all images before in it: counted in full again 30 times a second, they lifted a hidden elbow by 100 mm in half a second.
-A limb that is seen elsewhere than expected needs them in full: they bring it back from behind the trunk."""
+"""Factor on the information of ordinary postures for a hidden limb with a prediction, which includes that information
+from all previous images: counted in full 30 times a second, it lifted a hidden elbow by 100 mm in half a second. A
+visible limb away from its prediction needs it in full: it brings the limb back from behind the trunk."""
 _HAND: Final = 0.1
-"""Metres from a wrist to the middle of the hand, and what an elbow's surface may be off by."""
+"""Metres from a wrist to the middle of the hand, plus the error of an elbow's surface."""
 _LOOSE: Final = 8
-"""Least points that may be a hand."""
+"""Least number of unexplained points that may be a hand."""
 _REACHED: Final = 0.05
-"""Metres: standard deviation of a hand's place at such points."""
+"""Metres: standard deviation of a hand's position at such points."""
 _REACHING: Final = (0.2, 0.1, 0.06)
-"""Metres: robust scales of the steps towards them."""
+"""Metres: robust scale of each step of a fit towards such points."""
 _COLLARS: Final = 0.2
-"""The same share for collar bones beside any prediction: in full, ordinary postures took three quarters of a shrug
-away."""
+"""Factor on the information of ordinary postures for collar bones with a prediction: in full, ordinary postures removed
+three quarters of a shrug."""
 _HIDDEN: Final = 0.35
-"""Share of a limb's vertices behind something else from which on the limb is hidden: of an arm, forearm and hand."""
+"""Share of a limb's vertices behind something else, above which the limb is hidden: of an arm, forearm and hand."""
 FACING_CAMERA: Final[FloatArray] = np.diag([1.0, -1.0, -1.0])
-"""Orientation of a model whose person stands upright and looks into the camera."""
+"""Orientation of the first joint of a person who stands upright and faces the camera."""
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Deviations of the terms, one standard deviation each.
+    """Standard deviations of the energy terms.
 
     Attributes:
-        surface: metres between the body and what is measured of it, clothes and shape included.
-        patches: independent numbers among the measured points; clothes and shape err by whole patches.
-        silhouette: metres that the body may lie outside of the silhouette.
-        front: metres that the body may lie in front of what was measured. A small one pushes an arm that is measured
-            elsewhere into the trunk, where it stays.
-        limit: radians beyond a soft limit.
-        damping: share of the information's diagonal that is added at first.
-        unexplained: greatest sum, in a fit that is not lost, of the share of points that do not belong to the body and
-            that of seen vertices outside of the silhouette. A body that is too large for the person has many of the
-            latter and explains all points; bounds for each share lost such people, and kept more false fits.
+        surface: distance between the body and measured points, including clothes and shape, metres.
+        patches: number of independent patches among the measured points; clothes and shape err by whole patches.
+        silhouette: distance of the body outside the silhouette, metres.
+        front: distance of the body in front of the measured surface, metres. A small value pushes an arm that is
+            measured elsewhere into the trunk, where it stays.
+        limit: excess beyond a soft limit, radians.
+        damping: initial damping, as a share of the information's diagonal.
+        unexplained: largest sum, in a fit that is not lost, of the share of unexplained points and the share of visible
+            vertices outside the silhouette or in front of the surface. A body that is too large has many such vertices
+            and explains all points; separate bounds lost such people and kept more false fits.
     """
 
     surface: float = 0.012
@@ -78,13 +78,13 @@ class Settings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """A pose that is expected before the image is seen.
+    """A pose expected before the image is processed.
 
     Attributes:
-        pose: the expected one.
-        shift: metres, standard deviation of the first joint's place along each axis.
-        turns: (J, 3) radians, standard deviations about the axes of the segments' frames.
-        hidden: (J,) joints of limbs that something else than the person hides; none without.
+        pose: expected pose.
+        shift: standard deviation of the first joint's position along each axis, metres.
+        turns: (J, 3) standard deviations about the axes of the segments' frames, radians.
+        hidden: (J,) joints of limbs hidden by something other than the person; None for no joint.
     """
 
     pose: Pose
@@ -95,7 +95,7 @@ class Prediction:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Orientation:
-    """A segment's orientation by an inertial sensor.
+    """A segment's orientation from an inertial sensor.
 
     Attributes:
         joint: the segment's joint.
@@ -110,12 +110,12 @@ class Orientation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointPoints:
-    """Points of joints by another sensor, as of a Kinect's skeleton.
+    """Joint positions from another sensor, e.g. a Kinect's skeleton.
 
     Attributes:
-        joints: (n,) of the body model.
+        joints: (n,) indices in the body model.
         points: (n, 3) metres in the camera's frame.
-        stddev: metres.
+        stddev: per axis, metres.
     """
 
     joints: IntArray
@@ -125,20 +125,21 @@ class JointPoints:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """A pose and how well it fits.
+    """A pose and its goodness of fit.
 
     Attributes:
-        pose: the best one.
-        posed: the body in it.
+        pose: best pose.
+        posed: the body in this pose.
         frames: (J, 3, 3) anatomical frames of its segments, columns in the camera's axes.
         energy: half the sum of the squared, robust residuals.
         information: (3 + 3 J, 3 + 3 J) inverse covariance of the pose's change, see :mod:`body_tracking.mesh.energy`.
-        matches: of the measured points.
-        weights: (n,) of the measured points in the information, inverse square metres.
-        matched: share of the measured points that belong to the body.
-        violations: share of the vertices that face the camera that are outside of the silhouette or in front of it.
-        rms: metres, root mean square distance of the matched points from the planes of their matches.
-        lost: whether this is no fit of the person.
+        matches: correspondences of the measured points.
+        weights: (n,) of the measured points in the information, 1/m^2.
+        matched: share of measured points explained by the body.
+        violations: number of vertices outside the silhouette or in front of the surface, over that of vertices facing
+            the camera.
+        rms: root mean square distance of the explained points from the planes of their matches, metres.
+        lost: whether the fit is rejected.
     """
 
     pose: Pose
@@ -155,7 +156,7 @@ class Fit:
 
 
 def facing(course: FloatArray) -> FloatArray:
-    """(3, 3) rotation of the first joint of a person who stands upright and faces in a direction.
+    """(3, 3) rotation of the first joint of an upright person who faces a direction.
 
     Args:
         course: (3,) in the camera's frame, whose y axis is down.
@@ -175,12 +176,12 @@ class MeshFitter:
 
     Args:
         body: of the person.
-        settings: deviations of the terms.
+        settings: standard deviations of the terms.
 
     Attributes:
         body: of the person.
-        anatomy: angles of the body model.
-        ancestors: (J, J) whether a turn of the second joint's segment moves the first joint's.
+        anatomy: joint angles of the body model.
+        ancestors: (J, J) whether a rotation of the second joint's segment moves the first joint's.
     """
 
     def __init__(self, body: Body, settings: Settings | None = None) -> None:
@@ -202,12 +203,12 @@ class MeshFitter:
         ]
 
     def neutral(self, place: FloatArray, elevation: float = 0.0, flexion: float = 0.0) -> Pose:
-        """A person who stands upright and looks into the camera.
+        """Pose of a person who stands upright and faces the camera.
 
         Args:
-            place: (3,) metres, of the first joint in the camera's frame.
-            elevation: radians, of both arms sideways; hanging without.
-            flexion: radians, of both elbows.
+            place: (3,) position of the first joint in the camera's frame, metres.
+            elevation: of both arms sideways, radians; 0 for hanging arms.
+            flexion: of both elbows, radians.
         """
         anatomy = self.anatomy
         turned = np.tile(np.eye(3), (len(self.body.joints), 1, 1))
@@ -219,15 +220,15 @@ class MeshFitter:
         return Pose(rotations, place - self.body.joints[0])
 
     def with_hanging_arms(self, pose: Pose) -> Pose:
-        """A pose with the arms as in ordinary standing."""
+        """The pose with the arms as in ordinary standing."""
         rotations = pose.rotations.copy()
         rotations[self._arms] = self.neutral(np.zeros(3), 0.1, 0.3).rotations[self._arms]
         return Pose(rotations, pose.translation)
 
     def unmatched(self, observation: Observation, fit: Fit) -> dict[str, FloatArray]:
-        """By side, the points (n, 3) within an arm's reach that do not belong to the body in a fit, metres.
+        """By side, unexplained points (n, 3) within an arm's reach, metres.
 
-        A side with too few for a hand is left out.
+        A side with too few points for a hand is omitted.
         """
         offsets = fit.matches.places - observation.points
         loose = observation.points[(offsets * offsets).sum(axis=1) > MATCHED**2]
@@ -241,7 +242,7 @@ class MeshFitter:
         return found
 
     def towards_unmatched(self, observation: Observation, fit: Fit) -> list[Pose]:
-        """Poses with one hand at points that do not belong to the body in a fit; none where there are too few."""
+        """Poses with one hand at unexplained points; none if there are too few."""
         found = []
         for side, near in self.unmatched(observation, fit).items():
             shoulder, _, wrist = self._arm(side)
@@ -253,9 +254,9 @@ class MeshFitter:
         return found
 
     def reaching(self, pose: Pose, side: str, place: FloatArray) -> Pose:
-        """A pose with a wrist at a place (3,) in the camera's frame, or as near as the arm reaches.
+        """The pose with a wrist at a position (3,) in the camera's frame, or as near as the arm reaches.
 
-        The elbow bends as far as the distance asks for; the shoulder takes the least turn.
+        The distance determines the elbow's flexion; the shoulder makes the smallest rotation.
         """
         body, (shoulder, elbow, wrist) = self.body, self._arm(side)
         upper, fore = np.linalg.norm(np.diff(body.joints[[shoulder, elbow, wrist]], axis=0), axis=1)
@@ -281,11 +282,11 @@ class MeshFitter:
         return shoulder, elbow, wrist
 
     def hidden(self, observation: Observation, vertices: FloatArray) -> BoolArray:
-        """(J,) joints a good part of whose limb lies behind something else than the person.
+        """(J,) joints of limbs mostly hidden behind something other than the person.
 
         Args:
             observation: of the person.
-            vertices: (N, 3) where the body is expected.
+            vertices: (N, 3) predicted, metres.
         """
         behind = energy.behind_others(
             vertices, observation.camera.project(vertices), observation.depth, observation.mask, energy.MARGIN
@@ -295,12 +296,12 @@ class MeshFitter:
     def search(
         self, observation: Observation, orientations: Sequence[Orientation] = (), course: FloatArray | None = None
     ) -> Fit:
-        """The best fit from several starts of a person who stands somewhere in view.
+        """The best fit from several starts, for a person who stands somewhere in view.
 
         Args:
             observation: of the person.
             orientations: of inertial sensors.
-            course: (3,) direction in which the person walks, any length; without one the person faces the camera.
+            course: (3,) walking direction, any length; None for a person who faces the camera.
         """
         head = observation.points[:, 1].min()
         middle = np.median(observation.points, axis=0)
@@ -328,11 +329,11 @@ class MeshFitter:
 
         Args:
             observation: of the person.
-            start: pose of the first step.
-            prediction: expected pose; without one, ordinary postures alone hold what is not seen.
+            start: initial pose.
+            prediction: expected pose; without one, only ordinary postures constrain hidden joints.
             orientations: of inertial sensors.
-            joints: points of another sensor's skeleton.
-            scales: metres, robust scale of each step.
+            joints: joint positions from another sensor's skeleton.
+            scales: robust scale of each step, metres.
         """
         terms = (prediction, orientations, joints)
         pose, damping = start, self.settings.damping
@@ -349,7 +350,7 @@ class MeshFitter:
         return current.fit
 
     def moved(self, pose: Pose, step: FloatArray) -> Pose:
-        """A pose changed by (3 + 3 J,) numbers: shift of the first joint, turns about the axes of the segments."""
+        """The pose after a step (3 + 3 J,): shift of the first joint, rotations about the axes of the segments."""
         turns = np.einsum("jab,jb->ja", self.body.model.frames, step[3:].reshape(-1, 3))
         return Pose(pose.rotations @ so3.quat_to_matrix(so3.exp(turns)), pose.translation + step[:3])
 
@@ -362,9 +363,9 @@ class MeshFitter:
         orientations: Sequence[Orientation] = (),
         joints: JointPoints | None = None,
     ) -> Evaluation:
-        """The energy (Jatesiktat 2018, eq. 4 and 5) at a pose with its derivatives.
+        """The energy (Jatesiktat 2018, eq. 4 and 5) at a pose, with its derivatives.
 
-        Arguments are those of :meth:`fit`, with one robust scale, metres.
+        Arguments as in :meth:`fit`, with one robust scale, metres.
         """
         settings, body, model = self.settings, self.body, self.body.model
         posed = body.posed(pose)
@@ -389,7 +390,7 @@ class MeshFitter:
         )
         planes = (offsets * matches.normals).sum(axis=1)
         system.add(arms, matches.normals, planes, weights)
-        # a point whose surface faces another way costs as much as one that is far away
+        # a point whose match faces another way costs as much as a distant one
         total = share * float((agrees * cost + (1.0 - agrees) * scale**2).sum())
         # background (6) and in front of the measured surface (12)
         fx, fy = float(observation.camera.matrix[0, 0]), float(observation.camera.matrix[1, 1])
@@ -435,7 +436,7 @@ class MeshFitter:
         return Evaluation(fit, system.gradient)
 
     def _add_angles(self, system: _System, pose: Pose, hidden: BoolArray | None) -> float:
-        """Limits (Jatesiktat 2018, eq. 8) and ordinary postures, which count less for ``hidden`` joints (J,)."""
+        """Limits (Jatesiktat 2018, eq. 8) and ordinary postures, weighted less for ``hidden`` joints (J,)."""
         anatomy = self.anatomy
         angles = anatomy.angles(pose.rotations)
         excess = np.maximum(angles.values - anatomy.high, 0.0) + np.minimum(angles.values - anatomy.low, 0.0)
@@ -451,7 +452,7 @@ class MeshFitter:
         return float((limit * excess * excess + posture * off * off).sum())
 
     def _add_prediction(self, system: _System, pose: Pose, prediction: Prediction) -> float:
-        """What is expected before the image."""
+        """The predicted pose as a prior."""
         between = so3.rotation_vectors(prediction.pose.rotations.mT @ pose.rotations)
         between = np.einsum("jba,jb->ja", self.body.model.frames, between)
         weights = prediction.turns**-2.0
@@ -463,7 +464,7 @@ class MeshFitter:
         return float((weights * between * between).sum() + weight * (shift @ shift))
 
     def _add_orientation(self, system: _System, orientation: Orientation) -> float:
-        """Inertial sensors (Jatesiktat 2018, eq. 9-11), with the whole orientation."""
+        """Inertial sensors (Jatesiktat 2018, eq. 9-11), with whole orientations."""
         frame = system.frames[orientation.joint]
         off = so3.rotation_vectors(orientation.rotation.T @ frame)
         rows = np.zeros((3, len(system.gradient)))
@@ -473,7 +474,7 @@ class MeshFitter:
         return system.add_rows(rows, off, orientation.stddev**-2.0)
 
     def _add_joints(self, system: _System, posed: PosedBody, joints: JointPoints) -> float:
-        """Points of another sensor's skeleton."""
+        """Joint positions from another sensor's skeleton."""
         arms = posed.placed[joints.joints][:, None] - posed.placed[None]
         arms = np.where(self.ancestors[joints.joints][..., None], arms, 0.0)
         offsets = posed.placed[joints.joints] - joints.points
@@ -487,7 +488,7 @@ class MeshFitter:
 
 @dataclass(slots=True, eq=False)
 class _System:
-    """Normal equations that are being added up; the information's lower triangle counts."""
+    """Accumulated normal equations; only the information's lower triangle is used."""
 
     frames: FloatArray
     information: FloatArray
@@ -502,7 +503,7 @@ class _System:
         return float((weights * residuals * residuals).sum())
 
     def add_turns(self, gradients: FloatArray, weights: FloatArray, pull: FloatArray) -> None:
-        """Residuals (J, 3) of each joint's own turn, by its gradients (J, 3, 3)."""
+        """Add residuals (J, 3) of each joint's own rotation, with their gradients (J, 3, 3)."""
         blocks = np.tril(np.einsum("jba,jb,jbc->jac", gradients, weights, gradients))
         at = 3 + np.arange(3 * len(blocks)).reshape(-1, 3)
         self.information[at[:, :, None], at[:, None, :]] += blocks
@@ -511,11 +512,11 @@ class _System:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluation:
-    """A pose's fit, not yet improved.
+    """The fit of a pose before a step.
 
     Attributes:
         fit: of the pose.
-        gradient: (3 + 3 J,) of its energy by the pose's change.
+        gradient: (3 + 3 J,) of the energy by the pose's change.
     """
 
     fit: Fit
@@ -524,12 +525,12 @@ class Evaluation:
     def step(self, damping: float) -> FloatArray:
         """Levenberg-Marquardt step (Jatesiktat 2018, eq. 15-16; section II-F), scaled by the diagonal (Marquardt 1963).
 
-        Turns are limited to half a radian.
+        The largest rotation is limited to half a radian.
         """
         information = self.fit.information.copy()
         diagonal = np.arange(len(information))
         information[diagonal, diagonal] *= 1.0 + damping
-        information[diagonal, diagonal] += 1e-6  # nothing seen leaves the first joint's place open
+        information[diagonal, diagonal] += 1e-6  # without any match, the first joint's position is undetermined
         step = np.linalg.solve(information, -self.gradient)
         largest = float(np.abs(step[3:]).max())
         result: FloatArray = np.asarray(step * min(1.0, 0.5 / max(largest, 1e-9)), dtype=np.float64)
@@ -537,6 +538,6 @@ class Evaluation:
 
 
 def _robust(distances: FloatArray, scale: float) -> tuple[FloatArray, FloatArray]:
-    """Weights and costs of distances by the function of Geman and McClure (1985), metres."""
+    """Weights and costs (square metres) of distances (metres) by the function of Geman and McClure (1985)."""
     share = 1.0 / (1.0 + np.square(distances / scale))
     return share * share, np.square(distances) * share

@@ -1,4 +1,4 @@
-"""Depth images to the skeleton and the mesh of a person: the stage of the node ``mesh_tracker``."""
+"""Stage of the node ``mesh_tracker``: from depth images to the skeleton and mesh of a person."""
 
 from __future__ import annotations
 
@@ -67,9 +67,9 @@ ORIENTATIONS = Parameter(
 _ORIENTATIONS: Final = 32
 """Queue of orientations per segment: half a second."""
 _CALIBRATIONS: Final = 1000
-"""Queue of poses and clocks, long enough that none is lost while an image is fitted."""
+"""Queue of poses and clocks, long enough to lose none while an image is fitted."""
 _KEPT: Final = 64
-"""Images of a camera that wait with the parameter ``reliable``: two seconds, 60 MB at 512x424."""
+"""Queued images per camera with the parameter ``reliable``: two seconds, 60 MB at 512x424."""
 _NO_INFO: Final = "images without camera_info"
 
 
@@ -155,7 +155,7 @@ class MeshStage(Stage):
         return min((each for each in waiting if each is not None), default=None)
 
     def _of(self, sensor: DepthSensor, steady_ns: int) -> Iterator[Output]:
-        """The outputs of the images that need not wait for a body index any more."""
+        """The outputs of images that need not wait for a body index."""
         while (pair := sensor.pairs.next(steady_ns)) is not None:
             tracked = sensor.update(pair.stamp_ns, pair.depth, self._orientations, pair.bodies)
             if tracked is not None:
@@ -169,7 +169,7 @@ class MeshStage(Stage):
             yield Output(sensor.mesh_topic, (stamp_ns, frame_id, posed[sensor.body.model.faces]), stamp_ns)
 
     def _place(self, payload: SensorPose | SensorClock) -> None:
-        """Take a pose or a clock of the calibration; those of other sensors are not needed."""
+        """Take a pose or clock of the calibration; ignores those of other sensors."""
         for sensor in self.sensors.values():
             if payload.sensor != sensor.name:
                 continue
@@ -184,7 +184,7 @@ class MeshStage(Stage):
         return "move your arms and trunk before the camera: the shape of your body is estimated from different poses"
 
     def refused(self, topic: str) -> None:
-        """Count a message of another encoding, or a calibration that cannot be used."""
+        """Count a message of another encoding, or an unusable calibration."""
         if topic in self._bodies:
             self._bodies[topic].pairs.refuse()
             return
@@ -192,7 +192,7 @@ class MeshStage(Stage):
         counters["messages that cannot be used"] += 1
 
     def reset(self, topic: str) -> None:
-        """Forget the person, not the shape of the body; the body-index images, or the orientations of one segment."""
+        """Forget the person but not the body's shape, or the body-index images, or the orientations of one segment."""
         if topic in self._bodies:
             self._bodies[topic].pairs.forget_indices()
         elif topic in self._by_topic:
@@ -201,8 +201,8 @@ class MeshStage(Stage):
             self._orientations.forget(self._segments[topic])
 
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
-        """A camera without calibration, with images of another size, or whose lens is covered is named, and body-index
-        images that cannot be used.
+        """Warn of cameras without calibration, with images of another size or a covered lens, and of unusable
+        body-index images.
         """
         problems = [
             f"{name}: {problem}"
@@ -216,7 +216,7 @@ class MeshStage(Stage):
         return (1 if problems else 0), "; ".join(problems), values
 
     def save(self) -> None:
-        """Write the shape of the person's body, if it is new."""
+        """Write the shape of the person's body if it is new."""
         for sensor in self.sensors.values():
             sensor.save()
 
@@ -229,7 +229,7 @@ class MeshStage(Stage):
 
 
 class DepthSensor:
-    """One depth camera with the tracker of the person before it.
+    """One depth camera with the tracker of the person in front of it.
 
     Args:
         camera: its name.
@@ -237,11 +237,11 @@ class DepthSensor:
         events: lines for the log.
 
     Attributes:
-        name: of the sensor whose skeletons are published.
+        name: of the sensor under which the skeletons are published.
         body: of the person.
-        problem: why images are of no use; "" where they are, or where only nobody is there.
-        placement: pose of the camera in ``world``, and its clock, by the calibration.
-        pairs: the depth images that wait for their body index.
+        problem: why images are unusable; "" if they are usable, even if nobody is visible.
+        placement: pose of the camera in ``world`` and its clock, from the calibration.
+        pairs: depth images that wait for their body index.
 
     Raises:
         PersonFileError: the file of the person is invalid.
@@ -272,7 +272,7 @@ class DepthSensor:
 
     @property
     def counters(self) -> Counter[str]:
-        """Of images and of what became of them."""
+        """Counts of images by outcome."""
         return self._counters
 
     def _nobody(self) -> tuple[Body, FloatArray]:
@@ -280,7 +280,7 @@ class DepthSensor:
         return self._model.body(), np.eye(self._model.vertex_shapes.shape[2])
 
     def calibrate(self, camera: Camera) -> None:
-        """Take the intrinsics; the person is looked for anew where they have changed."""
+        """Take the intrinsics; if they have changed, start the tracker again."""
         if self._tracker is not None:
             if self._tracker.camera.is_like(camera):
                 return
@@ -293,16 +293,16 @@ class DepthSensor:
     def update(
         self, stamp_ns: int, depth: Any, worn: SensorOrientations, index: IndexArray | None = None
     ) -> Tracked | None:
-        """The person in an image, with the orientations of the inertial sensors that the person wears.
+        """Track the person in an image, with the orientations of worn inertial sensors.
 
         Args:
             stamp_ns: of the image.
             depth: (height, width) metres, 0 where missing.
             worn: the inertial sensors.
-            index: (height, width) body-index image of the same time, where there is one.
+            index: (height, width) body-index image of the same time, if there is one.
 
         Raises:
-            DepthError: another size than that of the calibration.
+            DepthError: a size other than the calibrated one.
         """
         if self._tracker is None:
             self._counters[_NO_INFO] += 1
@@ -319,7 +319,7 @@ class DepthSensor:
             raise
         self.problem = COVERED if self._tracker.problem == COVERED else ""
         if self._counters["people lost"] > gone and not self._known:
-            # the next one may be somebody else
+            # the next person may be somebody else
             self._poses = DistinctPoses(self._model, self._needed)
             self._wear(*self._nobody())
         if tracked is not None and not self._poses.complete:
@@ -327,7 +327,7 @@ class DepthSensor:
         return tracked
 
     def _collect(self, tracker: MeshTracker, tracked: Tracked) -> None:
-        """Keep the image if its pose is a new one, and estimate the shape when there are enough."""
+        """Keep the image if its pose is new, and estimate the shape once there are enough."""
         assert tracker.observation is not None
         self._poses.offer(tracker.observation, tracked.fit.pose)
         if not self._poses.complete:
@@ -351,18 +351,18 @@ class DepthSensor:
             self._tracker.wear(body, covariance)
 
     def personalise_anew(self) -> None:
-        """Estimate the shape from the next poses, whoever it was of before."""
+        """Estimate the shape anew from the next poses, also if a file gave it."""
         self._poses = DistinctPoses(self._model, self._needed or int(str(_PERSONALISED_FROM.default)))
 
     def mesh_is_due(self, stamp_ns: int) -> bool:
-        """Whether the mesh of an image is to be published; it is counted as published then."""
+        """Whether the mesh of an image is due for publishing; if so, it counts as published."""
         if self._drawn_ns is not None and 0 <= stamp_ns - self._drawn_ns < self._mesh_ns:
             return False
         self._drawn_ns = stamp_ns
         return True
 
     def reset(self) -> None:
-        """Forget the person and the background; the newest pose and clock of the camera hold from now on."""
+        """Forget the person and the background; keep the newest pose and clock of the camera."""
         self.placement.restart()
         self.pairs.forget_depth()
         if self._tracker is not None:
@@ -373,15 +373,15 @@ class DepthSensor:
         return {} if self._tracker is None else self._tracker.state()
 
     def save(self) -> None:
-        """Write the shape of the body into the file, if it is new.
+        """Write the shape of the body to the file if it is new.
 
         Raises:
-            PersonFileError: it cannot be written.
+            PersonFileError: the file cannot be written.
         """
         if self._file is not None and self._changed:
             self.save_to(self._file)
         self._changed = False
 
     def save_to(self, file: Path) -> None:
-        """Write the shape of the body; errors as of :meth:`save`."""
+        """Write the shape of the body; raises the errors of :meth:`save`."""
         storage.save(file, self.body.shape, self._covariance)

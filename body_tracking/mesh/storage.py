@@ -19,11 +19,11 @@ _HEADER: Final = """\
 
 
 class PersonFileError(BodyTrackingError):
-    """A file of a person's shape cannot be read or written."""
+    """Raised for a person's shape file that cannot be read or written."""
 
 
 def save(path: Path, shape: FloatArray, covariance: FloatArray) -> None:
-    """Write a shape (S,) with its covariance (S, S); the file is replaced as a whole or not at all.
+    """Write a shape (S,) with its covariance (S, S); replaces the file atomically.
 
     Raises:
         PersonFileError: the file cannot be written.
@@ -39,7 +39,7 @@ def load(path: Path, model: BodyModel) -> tuple[Body, FloatArray]:
     """The body of a person, and the covariance (S, S) of its shape.
 
     Raises:
-        PersonFileError: the file is missing, is not YAML, or its numbers are no shape of this model.
+        PersonFileError: the file is missing, is not YAML, or holds no valid shape of this model.
     """
     count = model.vertex_shapes.shape[2]
     try:

@@ -1,4 +1,4 @@
-"""The mesh system: depth cameras, and the mesh of a body that is fitted to their images."""
+"""The mesh system: a body mesh fitted to the images of depth cameras."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
 
 
 def _orientations(options: Options) -> dict[str, Value]:
-    """The segments whose orientations are in the fit."""
+    """Default of ``orientations``: the arm segments with inertial sensors."""
     imus = options["imus"]
     worn = graph.imu_topics(imus if isinstance(imus, tuple) else ())
     segments = tuple(each.segment for each in worn if each.segment in graph.ARM_SEGMENTS)

@@ -1,4 +1,4 @@
-"""Topics of the mesh system (names as of depth_image_proc)."""
+"""Topics of the mesh system (names as in depth_image_proc)."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from body_tracking.core.qos import Qos
 from body_tracking.pipeline.graph import ARM_SEGMENTS
 
 IMAGES: Final = Qos(reliability="reliable", depth=10)
-"""Of images: best effort loses one in fourteen."""
+"""QoS of images: best effort loses one in fourteen."""
 MESH_SUFFIX: Final = "_mesh"
-"""Of the sensor whose skeletons the tracker publishes."""
+"""Suffix of the sensor name under which the tracker publishes skeletons."""
 
 PERSONALISE_SERVICE: Final = "mesh_tracker/personalise"
 
@@ -18,7 +18,7 @@ _TURNED_BY: Final = {"upper_arm": "shoulder", "forearm": "elbow", "hand": "wrist
 JOINTS_OF: Final = {
     each: f"{side}_{_TURNED_BY[segment]}" for each in ARM_SEGMENTS for segment, _, side in [each.rpartition("_")]
 }
-"""Joint of the mesh that turns each segment whose inertial sensor the fit can use."""
+"""Joint of the mesh at the start of each segment whose inertial sensor the fit can use."""
 
 
 def depth_topic(sensor: str) -> str:
@@ -27,12 +27,12 @@ def depth_topic(sensor: str) -> str:
 
 
 def info_topic(sensor: str) -> str:
-    """The calibration of its depth camera."""
+    """The calibration of a sensor's depth camera."""
     return f"/{sensor}/depth/camera_info"
 
 
 def body_index_topic(sensor: str) -> str:
-    """Of sensors that have it: the number of the body at each pixel, 255 for none; with the stamps of depth images."""
+    """Body-index images of a sensor: the body's number at each pixel, 255 for none; stamps equal the depth images'."""
     return f"/{sensor}/body_index/image_raw"
 
 
@@ -42,5 +42,5 @@ def mesh_topic(sensor: str) -> str:
 
 
 def mesh_sensor(sensor: str) -> str:
-    """The sensor whose skeletons are those of the mesh that is fitted to a depth camera's images."""
+    """Name of the sensor under which the skeletons of a depth camera's mesh are published."""
     return f"{sensor}{MESH_SUFFIX}"

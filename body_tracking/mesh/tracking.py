@@ -1,9 +1,9 @@
-"""Tracking of one person through depth images: find the pixels, fit the body, notice when it is lost.
+"""Tracking of one person through depth images: segmentation, fit, detection of a lost fit.
 
-Each image is fitted from where the last motion leads. A fit that is lost is tried again with a wide robust scale, from
-the last pose and from another sensor's skeleton where there is one, and then by a search; a person who stays lost is
-searched for anew, in the next candidate of a person's size each time. A person who walks is expected to face that way:
-such starts are tried where the fit leaves points of the person unexplained.
+Each fit starts from the predicted pose. A lost fit is tried again with a wide robust scale, from the last pose and from
+another sensor's skeleton if there is one, and then by a search; a person who stays lost is searched for among the
+candidates of a person's size in turn. A walking person is expected to face the walking direction: such starts are tried
+where the fit leaves points of the person unexplained.
 """
 
 from __future__ import annotations
@@ -34,40 +34,40 @@ from body_tracking.mesh.uncertainty import kinect_landmarks, placed
 
 _RATES: Final = {"shoulder": 9.0, "elbow": 9.0, "wrist": 9.0, "collar": 3.0}
 _TRUNK_RATE: Final = 3.0
-"""rad/s by which a joint may turn otherwise than before, one standard deviation; arms, and all others."""
+"""rad/s: standard deviation of a joint's change of angular velocity; arms, and all others."""
 _SHIFT_RATE: Final = 1.0
-"""m/s by which the pelvis may move otherwise than before, one standard deviation."""
+"""m/s: standard deviation of the pelvis's change of velocity."""
 _KEPT: Final = 0.7
-"""Share of the last change of pose that is expected again."""
+"""Factor on the last change of pose in the prediction."""
 _LONGEST_S: Final = 0.2
-"""Seconds between two images whose change of pose is a rate."""
+"""Longest time between two images for which their change of pose gives a rate, seconds."""
 _SKELETON: Final = 0.08
-"""Metres: standard deviation of the joints of another sensor's skeleton as a start."""
+"""Metres: standard deviation of the joints of another sensor's skeleton, used as a start."""
 _COURSE_S: Final = 0.5
-"""Seconds over which the velocity of a person who walks is measured."""
+"""Seconds over which a walking person's velocity is measured."""
 _SLOWEST: Final = 0.35
 _FASTEST: Final = 3.0
-"""m/s, horizontally, of a person who walks; what is faster is another person."""
+"""m/s: horizontal speed of a walking person; a faster one indicates a change of person."""
 _SMALLER: Final = (-1.6, -3.2)
-"""Standard deviations of the first shape component, the size: bodies of 1.54 and 1.38 m. The mean one, of 1.70 m, fits
+"""First shape component (size) of smaller bodies, standard deviations: 1.54 and 1.38 m. The mean body of 1.70 m fits
 people of 1.60 to 2 m."""
 _WHOLE: Final = 0.99
-"""Share of points that belong to the body below which an arm may be elsewhere than fitted."""
+"""Share of explained points below which a start with hanging arms is tried."""
 _EXPLAINED: Final = 0.97
-"""Share of points that belong to the body below which a hand may be where points are that do not."""
+"""Share of explained points below which a hand may be at unexplained points."""
 _ELSEWHERE: Final = 0.15
-"""Metres: standard deviation per axis that the joints of such an arm have in addition."""
+"""Metres: additional standard deviation per axis of such an arm's joints."""
 _LIMBS: Final = {
     side: [Joint[f"{name}_{side.upper()}"] for name in ("ELBOW", "WRIST", "HAND", "HAND_TIP", "THUMB")]
     for side in ("left", "right")
 }
 _SEEN: Final = 0.05
-"""Metres: standard deviation per axis up to which a joint counts as tracked; others are inferred."""
+"""Metres: largest standard deviation per axis of a tracked joint; others are inferred."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrackerParameters:
-    """Settings of the tracker; each field's metadata has its meaning, unit and range."""
+    """Settings of the tracker; each field's metadata states its meaning, unit and range."""
 
     points: int = field(
         default=600, metadata={"doc": "number of measured points of the person per fit", "min": 100, "max": 5000}
@@ -93,7 +93,7 @@ class Tracked:
     covariance: FloatArray
 
     def skeleton(self, frame_id: str, body: int = 0) -> Skeleton:
-        """The joints as a sensor's skeleton; those that the image does not place are inferred."""
+        """The joints as a sensor's skeleton; joints with a large covariance are inferred."""
         spread = np.sqrt(np.trace(self.covariance, axis1=1, axis2=2) / 3.0)
         states = np.where(spread < _SEEN, TrackingState.TRACKED, TrackingState.INFERRED).astype(np.uint8)
         return Skeleton(self.stamp_ns, frame_id, self.points, states, body, covariances=self.covariance)
@@ -107,11 +107,11 @@ class MeshTracker:
         body: of the person.
         shape_covariance: (S, S) of the body's shape components.
         parameters: settings.
-        counters: that go on from a tracker before.
+        counters: of a previous tracker to continue; None for new ones.
 
     Attributes:
-        problem: why there is no person in the last image; "" where there is one.
-        counters: of images and what became of them.
+        problem: why no person was found in the last image; "" if one was.
+        counters: of images by outcome.
     """
 
     def __init__(
@@ -129,9 +129,9 @@ class MeshTracker:
         self.reset()
 
     def wear(self, body: Body, shape_covariance: FloatArray) -> None:
-        """Track with another body from now on, as after a personalisation.
+        """Change to another body, e.g. after a personalisation.
 
-        The mean one is nobody's: whom it does not fit is searched for with smaller ones, too.
+        With the mean body, a person whom it does not fit is searched for with smaller bodies, too.
         """
         self._shape_covariance = shape_covariance
         self._fitters = [MeshFitter(body)]
@@ -176,17 +176,17 @@ class MeshTracker:
         orientations: Sequence[Orientation] = (),
         skeleton: Skeleton | None = None,
     ) -> Tracked | None:
-        """The person in the next image.
+        """Track the person in the next image.
 
         Args:
-            stamp_ns: of the image.
+            stamp_ns: of the image, nanoseconds.
             depth: (height, width) metres, 0 where missing.
-            index: (height, width) body-index image of the same time, where there is one.
+            index: (height, width) body-index image of the same time, if there is one.
             orientations: of inertial sensors.
-            skeleton: by another sensor in the same frame, a start where the person is lost.
+            skeleton: from another sensor in the same frame, used as a start if the person is lost.
 
         Returns:
-            None where nobody is found, or the fit is lost.
+            The person; None if nobody is found, or the fit is lost.
 
         Raises:
             DepthError: another size than the camera's.
@@ -230,7 +230,7 @@ class MeshTracker:
         return Tracked(stamp_ns, fit, result.points, result.covariance)
 
     def _indexed(self, index: NDArray[np.uint8], depth: SingleArray, expected: Fit | None) -> BoolArray:
-        """The person's pixels by a body-index image."""
+        """The person's mask from a body-index image."""
         self._view.check(depth)
         close = None if expected is None else near(expected.posed.vertices, depth, self._view.camera, REACH)
         mask, body = of_body_index(index, depth, close, self._choice)
@@ -240,7 +240,7 @@ class MeshTracker:
     def _fit(
         self, stamp_ns: int, seen: Observation, orientations: Sequence[Orientation], skeleton: Skeleton | None
     ) -> Fit | None:
-        """The best fit that is at hand; None where it is not yet time to search again."""
+        """The best available fit; None if it is not yet time to search again."""
         points = None if skeleton is None else self._points_of(skeleton)
         if self._fits:
             prediction = self._predicted(stamp_ns, seen)
@@ -262,7 +262,7 @@ class MeshTracker:
         return fit
 
     def _searched(self, seen: Observation, orientations: Sequence[Orientation]) -> Fit:
-        """The best fit of somebody who was not tracked before; a smaller body is kept for them if only that fits."""
+        """The best fit of an untracked person; a smaller body is kept if only it fits."""
         course = self._course()
         fit = self._fitter.search(seen, orientations, course)
         if fit.lost and len(self._fitters) > 1:
@@ -275,7 +275,7 @@ class MeshTracker:
         return fit
 
     def _may_search(self, stamp_ns: int) -> bool:
-        """Whether the last search is long enough ago; then this counts as one."""
+        """Whether the last search is long enough ago; if so, this call counts as a search."""
         if self._waits(stamp_ns, self._searched_ns):
             return False
         self._searched_ns = stamp_ns
@@ -283,11 +283,11 @@ class MeshTracker:
         return True
 
     def _waits(self, stamp_ns: int, last_ns: int | None) -> bool:
-        """Whether what was last done at a time is not to be done again yet."""
+        """Whether an action last done at ``last_ns`` has to wait."""
         return last_ns is not None and 0 <= stamp_ns - last_ns < self.parameters.search_every * NANOSECONDS
 
     def _course(self) -> FloatArray | None:
-        """(3,) m/s of a person who walks, and so faces that way; None of one who may stand."""
+        """(3,) velocity of a walking person in m/s, whose direction they face; None if the person may be standing."""
         (first_ns, first), (last_ns, last) = self._places[0], self._places[-1]
         elapsed = (last_ns - first_ns) / NANOSECONDS
         if elapsed < _COURSE_S / 5.0:
@@ -296,11 +296,11 @@ class MeshTracker:
         return velocity if _SLOWEST < np.hypot(velocity[0], velocity[2]) < _FASTEST else None
 
     def _with_arms(self, stamp_ns: int, seen: Observation, orientations: Sequence[Orientation], fit: Fit) -> Fit:
-        """A fit, or a better one with the arms elsewhere.
+        """The fit, or a better one with the arms elsewhere.
 
-        The trunk's surface holds an arm that it hid for some images: a start with hanging arms. A hand that was faster
-        than expected leaves points of the person unexplained: starts with a hand there, and those of a search
-        for somebody who walks.
+        The trunk's surface can hold an arm that was hidden behind it for some images: a start with hanging arms frees
+        it. A hand faster than predicted leaves unexplained points: starts with the hand there, and for a walking person
+        those of a search.
         """
         starts = [] if fit.matched >= _EXPLAINED else self._fitter.towards_unmatched(seen, fit)
         if starts:
@@ -313,7 +313,7 @@ class MeshTracker:
         course = self._course()
         if fit.matched < _EXPLAINED and course is not None and self._may_search(stamp_ns):
             found = self._fitter.search(seen, orientations, course)
-            # front and back look alike in depth, so what turns a tracked person away from the course is not believed
+            # front and back look alike in depth, so a pose that faces away from the walking direction is rejected
             fits += [found] if is_along(found.pose, course) else []
         if not fits:
             return fit
@@ -322,7 +322,7 @@ class MeshTracker:
         return again if not again.lost and again.energy < here.energy else fit
 
     def _predicted(self, stamp_ns: int, seen: Observation) -> Prediction:
-        """The last pose, moved on by its last change where that is known."""
+        """Prediction from the last pose and its last change."""
         last_ns, last = self._fits[-1]
         elapsed = max((stamp_ns - last_ns) / NANOSECONDS, 1e-3)
         pose = last.pose
@@ -338,7 +338,7 @@ class MeshTracker:
         return Prediction(pose, 0.01 + _SHIFT_RATE * elapsed, 0.05 + self._rates * elapsed, hidden)
 
     def _points_of(self, skeleton: Skeleton) -> JointPoints | None:
-        """The joints that body model and skeleton share."""
+        """The joints common to the body model and the skeleton."""
         names = self.body.model.joint_names
         pairs = [
             (names.index(f"{side}_{name}"), number)
@@ -352,7 +352,7 @@ class MeshTracker:
         return JointPoints(own, skeleton.positions[theirs], _SKELETON)
 
     def _forget(self, stamp_ns: int) -> None:
-        """A person who was lost for too long is not expected any more."""
+        """Note that the person is lost; after ``predict_for`` seconds forget them."""
         self._lost_ns = stamp_ns if self._lost_ns is None else self._lost_ns
         if self._fits and stamp_ns - self._lost_ns > self.parameters.predict_for * NANOSECONDS:
             self._fits = []
@@ -374,14 +374,14 @@ class MeshTracker:
 
 
 def observe_person(view: DepthCamera, depth: SingleArray, mask: BoolArray, count: int) -> Observation:
-    """What is fitted of a person, without flying pixels; arguments and errors as of :func:`observe`."""
+    """Observation of a person without flying pixels; arguments and errors as of :func:`observe`."""
     return observe(view, _without_flying(depth, mask), mask, count)
 
 
 def _without_flying(depth: SingleArray, mask: BoolArray) -> SingleArray:
-    """The image without pixels that lie on no surface, in the box about the mask."""
+    """The image without pixels off surfaces, within the mask's bounding box."""
     left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
-    # the outermost pixels of a block have too few neighbours
+    # pixels at the border of a block have too few neighbours
     box = slice(max(top - 2, 0), top + height + 2), slice(max(left - 2, 0), left + width + 2)
     clean = depth.copy()
     block = np.ascontiguousarray(depth[box])
@@ -391,7 +391,7 @@ def _without_flying(depth: SingleArray, mask: BoolArray) -> SingleArray:
 
 @cache
 def prepare() -> None:
-    """Compile the loops, or load them, before the first image: a person is found, tracked and personalised."""
+    """Compile the loops, or load them, before the first image: detect, track and personalise a rendered person."""
     matrix = np.array([[92.0, 0.0, 64.0], [0.0, 92.0, 53.0], [0.0, 0.0, 1.0]])
     view = DepthCamera(Camera("prepared", 128, 106, matrix, np.zeros(5)))
     body = load().body()

@@ -1,8 +1,8 @@
 """Joints of a fitted body with their covariance.
 
-The information of a fit counts its points as about 40 independent patches. What errs for longer than a frame does not
-average out at all: the person's shape, and the cloth on each segment. Both are considered parameters (Schmidt 1966):
-they are not estimated with the pose, but their covariance goes through the fit into the joints.
+The information of a fit counts its points as about 40 independent patches. Errors that persist over frames do not
+average out: the person's shape, and the cloth on each segment. Both are considered parameters (Schmidt 1966): they are
+not estimated with the pose, but their covariance propagates through the fit into the joints.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from body_tracking.mesh.skinning import lever_arms
 from body_tracking.mesh.solver import Fit, MeshFitter
 
 CLOTH: Final = 0.008
-"""Metres: standard deviation of the cloth's thickness on a segment about its mean."""
+"""Metres: standard deviation of the cloth's thickness on a segment."""
 RESIDUAL_SHAPE: Final = 0.004
-"""Metres: standard deviation of a joint's place in the segment by what the shape components leave out."""
+"""Metres: standard deviation of a joint's position in its segment beyond the shape components."""
 
 _BONES: Final = {
     Joint.SPINE_BASE: "pelvis",
@@ -37,17 +37,17 @@ _BONES: Final = {
         )
     },
 }
-"""Joints of the Kinect's set that are joints of the model."""
+"""Joints of the Kinect's set that exist in the model."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Landmarks:
-    """Points that move with one bone each.
+    """Points that are each attached to one bone.
 
     Attributes:
-        bones: (n,) joints of the model that carry them.
+        bones: (n,) joints of the model that move them.
         places: (n, 3) metres, at rest.
-        shapes: (n, 3, S) change by the shape components.
+        shapes: (n, 3, S) derivative by the shape components.
     """
 
     bones: IntArray
@@ -58,9 +58,9 @@ class Landmarks:
 def kinect_landmarks(body: Body) -> Landmarks:
     """The Kinect's 25 joints on a body.
 
-    Joints are the model's where it has them: centres of rotation, where a Kinect's lie up to 3 cm nearer to the skin.
-    SpineShoulder is the middle between the inner ends of the collar bones, Head the centre of the head, Hand the centre
-    of the closed hand; the hand's tip, the thumb's side and the foot's tip are points of the skin.
+    Joints are the model's centres of rotation where it has them; a Kinect's lie up to 3 cm nearer to the skin.
+    SpineShoulder is the midpoint of the inner ends of the collar bones, Head the centre of the head, Hand the centre of
+    the closed hand; the tips of hand and foot and the side of the thumb are points of the skin.
     """
     model = body.model
     vertices, shapes = body.vertices, model.vertex_shapes
@@ -102,7 +102,7 @@ class Placed:
     Attributes:
         points: (n, 3) metres in the camera's frame.
         covariance: (n, 3, 3) square metres.
-        pose_variances: (3 + 3 J,) of the pose's change, square metres and square radians.
+        pose_variances: (3 + 3 J,) of the pose's change, m^2 and rad^2.
     """
 
     points: FloatArray
@@ -116,7 +116,7 @@ def placed(
     """Landmarks of a fit with their covariance.
 
     Args:
-        fitter: that made the fit.
+        fitter: source of the fit.
         fit: of one image.
         observation: of that image.
         landmarks: of the fitter's body.
@@ -124,7 +124,7 @@ def placed(
     """
     body, model, posed = fitter.body, fitter.body.model, fit.posed
     joints, components = len(model.parents), model.vertex_shapes.shape[2]
-    # rows of the data term by the pose, the shape and the cloth on each segment
+    # Jacobians of the data term by the pose, the shape and the cloth on each segment
     corners, shares = fit.matches.corners, fit.matches.shares
     arms = lever_arms(
         *(corners, shares, posed.rest, model.bones, model.weights, model.parents, body.joints),
@@ -146,7 +146,7 @@ def placed(
     own = np.linalg.inv(fit.information + 1e-6 * np.eye(len(fit.information)))
     gain = own @ (rows.T * fit.weights) @ others
     pose = own + gain @ considered @ gain.T
-    # landmarks by the pose and by the shape
+    # Jacobians of the landmarks by the pose and by the shape
     bones = landmarks.bones
     turned = posed.turned[bones]
     points = np.einsum("nab,nb->na", turned, landmarks.places - body.joints[bones]) + posed.placed[bones]
@@ -162,7 +162,7 @@ def placed(
 
 @compiled
 def pose_rows(arms: FloatArray, directions: FloatArray, frames: FloatArray) -> FloatArray:
-    """(n, 3 + 3 J) derivatives of points (by their lever arms, (n, J, 3)) along directions (n, 3) by the pose."""
+    """(n, 3 + 3 J) derivatives of points along directions (n, 3) by the pose; arms: (n, J, 3) lever arms."""
     count, joints = arms.shape[0], arms.shape[1]
     rows = np.zeros((count, 3 + 3 * joints))
     for n in range(count):
@@ -179,7 +179,7 @@ def pose_rows(arms: FloatArray, directions: FloatArray, frames: FloatArray) -> F
 
 
 def joint_shape_gradients(model: BodyModel, posed: PosedBody) -> FloatArray:
-    """(J, 3, S) metres: change of the posed joints by the shape components, the pose held."""
+    """(J, 3, S) derivative of the posed joints by the shape components at a fixed pose, metres."""
     moved = np.empty_like(model.joint_shapes)
     moved[0] = model.joint_shapes[0]
     for joint in range(1, len(moved)):
@@ -200,17 +200,17 @@ def point_shape_gradients(
     turned: FloatArray,
     moved_joints: FloatArray,
 ) -> FloatArray:
-    """(P, 3, S) metres: change of points on the surface by the shape components, the pose held.
+    """(P, 3, S) derivative of points on the surface by the shape components at a fixed pose, metres.
 
     Args:
-        corners: (P, C) vertices that carry each point, with ``shares`` (P, C).
+        corners: (P, C) vertices that define each point, with ``shares`` (P, C).
         shares: see ``corners``.
         vertex_shapes: (N, 3, S) of the model.
         joint_shapes: (J, 3, S) of the model.
         bones: (N, K), with ``weights`` (N, K).
         weights: see ``bones``.
         turned: (J, 3, 3) orientations of the joints.
-        moved_joints: (J, 3, S) of :func:`joint_shape_gradients`.
+        moved_joints: (J, 3, S) from :func:`joint_shape_gradients`.
     """
     components = vertex_shapes.shape[2]
     moved = np.zeros((len(corners), 3, components))
