@@ -1,4 +1,4 @@
-"""``body_tracking`` without a command: says what to do next, by what is here: ROS, sensors, a graph, recordings."""
+"""``body_tracking`` without a command: suggests commands, depending on ROS, sensors, a running graph and recordings."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _SHOWN: Final = 3
 """Recordings that are named at most."""
 
 Step: TypeAlias = tuple[str, tuple[str, ...]]
-"""What is here, and commands for it."""
+"""What was found, and commands for it."""
 
 
 def steps(folder: Path) -> Iterator[Step]:
-    """What can be done in a folder, the most likely first."""
+    """The possible next steps in a folder, the most likely first."""
     page = " --viewer" if find_spec("viser") is not None else ""
     if find_spec("rclpy") is None:
         ways = ("pip install 'body_tracking[ros]'", ". /opt/ros/jazzy/setup.bash")
@@ -44,7 +44,7 @@ def steps(folder: Path) -> Iterator[Step]:
 
 
 def _domain(page: str) -> Iterator[Step]:
-    """What publishes in the ROS domain."""
+    """The next step by the nodes that publish in the ROS domain."""
     from body_tracking.ros.discovery import look
 
     dds.stay_on_this_machine()

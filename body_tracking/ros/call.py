@@ -1,4 +1,4 @@
-"""``body_tracking call``: calls a service of a running graph, which takes no ``ros2``, or lists the services."""
+"""``body_tracking call``: calls a service of a running graph without ``ros2``, or lists the services."""
 
 from __future__ import annotations
 

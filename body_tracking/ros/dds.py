@@ -32,8 +32,8 @@ def stay_on_this_machine() -> None:
 
     A killed node leaves shared memory behind that the others go on writing to; until they notice, up to 3 s, its
     successor receives nothing. So shared memory is not used. With the range ``LOCALHOST`` rmw_fastrtps insists on it;
-    the profile restricts to this machine without it. (A short lease would remove dead nodes sooner, but on a busy
-    machine also living ones, which may then never be discovered again.)
+    the profile restricts discovery to this machine without it. (A short lease would remove dead nodes sooner, but on a
+    busy machine also living ones, which may then never be discovered again.)
     """
     chosen = os.environ.get(_RANGE)
     if chosen is None and "ROS_LOCALHOST_ONLY" not in os.environ:

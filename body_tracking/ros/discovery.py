@@ -1,4 +1,4 @@
-"""What publishes in the ROS domain: the sensors that ``up`` takes where none are named, and a graph that runs."""
+"""Discovery in the ROS domain: the sensors that ``up`` takes if none are named, and a running graph."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Watch:
         rclpy.try_shutdown(context=self._context)
 
     def now(self) -> Domain:
-        """What has been discovered and is there still."""
+        """The sensors, graph and nodes that are discovered at present."""
         topics: dict[str, str] = {}
         for topic, kinds in self._node.get_topic_names_and_types():
             own = names.within(topic, self._namespace)

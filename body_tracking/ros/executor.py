@@ -26,7 +26,7 @@ _MESSAGE_ONLY = Subscription.CallbackType.MessageOnly
 
 
 class BatchNode(Node):
-    """A node whose messages come in batches: all that wait when the executor looks."""
+    """A node whose messages come in batches: all messages that wait when the executor checks."""
 
     def guarded(self, where: str, callback: Callable[..., Any]) -> Callable[..., Any]:
         """A callback that returns None instead of raising; ``where`` names it in the log."""

@@ -41,7 +41,7 @@ def calibration_part(status: NodeStatus | None, sensors: Collection[str]) -> lis
 
 
 def problem_parts(statuses: Mapping[str, NodeStatus]) -> list[str]:
-    """What nodes report as a problem, by their names; without the calibration, which has a part of its own."""
+    """The problems that nodes report, with their names; not those of the calibration, which has a part of its own."""
     bad = {name: each.text for name, each in statuses.items() if each.level and each.text and name != "calibration"}
     return [f"{name}: {text}" for name, text in sorted(bad.items())]
 
@@ -126,7 +126,7 @@ class GraphMonitor:
     def has_subscribers(self, wanted: Mapping[str, int], nodes: Collection[str]) -> bool:
         """Whether the publishers of these topics report at least so many subscribers.
 
-        Only the publisher's own report counts, because discovery takes another time in every process.
+        Only the publisher's own report counts, because the time of discovery differs between processes.
 
         Args:
             wanted: numbers by topic; a topic that none of the nodes publishes does not count.
@@ -182,7 +182,7 @@ class GraphMonitor:
         return f"{skeletons}angles {angles} Hz"
 
     def _angles_rate(self, topic: str, fresh: Mapping[str, NodeStatus]) -> str:
-        """Of the one node that publishes it."""
+        """The rate of a topic, in hertz, by the node that publishes it."""
         key = f"rate out {names.resolved(topic, self._namespace)}"
         found = [status.values[key] for status in fresh.values() if key in status.values]
         return f"{float(found[0]):.0f}" if found else "-"

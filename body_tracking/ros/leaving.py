@@ -12,7 +12,7 @@ _CLOCK_MONOTONIC, _SIGEV_THREAD = 1, 2
 
 
 class _Sigevent(ctypes.Structure):
-    """``struct sigevent`` of Linux; ``value`` is what the function is called with."""
+    """``struct sigevent`` of Linux; ``value`` is the argument of the function."""
 
     _fields_ = (
         ("value", ctypes.c_void_p),
@@ -26,18 +26,18 @@ class _Sigevent(ctypes.Structure):
 
 @contextlib.contextmanager
 def leaving_within(seconds: float, code: int) -> Iterator[None]:
-    """End the process where what is done within takes longer than that.
+    """End the process if the body of the ``with`` statement takes too long.
 
-    A process that is killed may hold a mutex in the shared memory by which Fast DDS 2.14 sends. Its thread for timers
-    then waits for that mutex for ever (``SharedMemManager::Port::regenerate_port``), and who destroys a writer waits
-    for that thread. rclpy holds the interpreter's lock meanwhile, so that no thread of Python can end the process. A
-    timer of the C library calls ``_exit`` in a thread of its own.
+    A process that is killed may hold a mutex in the shared memory by which Fast DDS 2.14 sends. Fast DDS's thread for
+    timers in another process then waits for that mutex for ever (``SharedMemManager::Port::regenerate_port``), and the
+    destruction of a writer waits for that thread. rclpy holds the interpreter's lock meanwhile, so that no thread of
+    Python can end the process. A timer of the C library calls ``_exit`` in a thread of its own.
 
     Args:
-        seconds: after which the process ends.
-        code: with which it ends then.
+        seconds: time after which the process ends.
+        code: its exit code then.
     """
-    for stream in (sys.stdout, sys.stderr):  # _exit would lose what they have not written
+    for stream in (sys.stdout, sys.stderr):  # _exit would lose their buffers
         with contextlib.suppress(OSError, ValueError):
             stream.flush()
     library = ctypes.CDLL(None)

@@ -143,7 +143,7 @@ def run(node_class: type[GraphNode]) -> None:
     finally:
         if node is not None:
             node.close()
-        # nothing is lost by then
+        # the node is closed: leaving early loses nothing
         with leaving_within(_LEAVE_S, code if sys.exc_info()[0] is None else 1):
             if node is not None:
                 with contextlib.suppress(InvalidHandle):

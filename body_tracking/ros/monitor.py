@@ -11,7 +11,7 @@ from body_tracking.core.clocks import JUMP_BACK_NS
 from body_tracking.core.skeleton import NANOSECONDS
 
 GAP_NS = 50_000_000
-"""Least distance of two stamps of a sensor with a gap between them: at 30 Hz one frame is missing."""
+"""Nanoseconds between two stamps of a sensor beyond which there is a gap: at 30 Hz one frame is missing."""
 
 
 class Monitor:
@@ -34,7 +34,7 @@ class Monitor:
         self.totals["received"] += 1
 
     def message_in(self, topic: str, stamp_ns: int) -> bool:
-        """Count a stamp of an input that is not next to the last one; True, uncounted, when time jumped back."""
+        """Count an irregular stamp of an input; True, without a count, if time jumped back."""
         last, self._last_stamp[topic] = self._last_stamp.get(topic), stamp_ns
         if last is None:
             return False

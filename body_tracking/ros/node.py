@@ -186,7 +186,7 @@ class GraphNode(BatchNode):
         return 0, "", {}
 
     def finish(self) -> None:
-        """Publish at the end what still waits for messages."""
+        """Publish at the end the outputs that still wait for messages."""
 
     def close(self) -> None:
         """Release resources at the end, also where there is no time for :meth:`finish`."""
@@ -284,7 +284,7 @@ class GraphNode(BatchNode):
             try:
                 result = callback(*given)
             except (ExternalShutdownException, InvalidHandle):
-                raise  # the executor's
+                raise  # for the executor
             except BodyTrackingError as error:
                 self.malformed(where, str(error), "malformed" if isinstance(error, MessageError) else "refused")
             except Exception as error:
@@ -430,8 +430,10 @@ class GraphNode(BatchNode):
         return [each for place, each in enumerate(messages) if place not in late] if late else messages
 
     def log_jump(self, topic: str) -> None:
-        """Log and count that an input's stamps jumped back: a fault, unless the clock of a recording that is played
-        again, or from an earlier place, went back before them.
+        """Log and count a backward jump of an input's stamps.
+
+        It is a fault, unless ``/clock`` went back before, as of a recording that is played again or from an earlier
+        place.
 
         Args:
             topic: full name.

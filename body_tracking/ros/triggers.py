@@ -49,7 +49,7 @@ class Triggers:
 
     def now(self) -> list[str]:
         """The services that have been discovered, sorted, relative to the namespace."""
-        # a name without a server is that of a client, as the viewer has one for each
+        # a name without a server belongs to a client alone; the viewer has a client for each service
         kinds = {name: kinds for name, kinds in self._types().items() if self._node.count_services(name)}
         found = (names.within(name, self._namespace) for name in kinds if _TRIGGER in kinds[name])
         return sorted(name.removeprefix("/") for name in found if name is not None)

@@ -83,7 +83,7 @@ FINISH_TIMEOUT = 60.0
 """Seconds for a node to handle its remaining messages after the end of a bag."""
 
 ANSWER_DELAY = 0.3
-"""Seconds for the answer to who asked for the graph's end."""
+"""Seconds for the answer to the caller of the service that ends the graph."""
 
 LOOK_PERIOD = 0.25
 """Seconds between two looks at the graph, for the status line and for another ``up``."""
@@ -297,7 +297,7 @@ class Supervisor:
                 self._bag_start_ns = reader.start_ns
 
     def run(self, monitor: GraphMonitor) -> None:
-        """Run until the bag ends, somebody ends it or a node cannot start, for which :attr:`failure` has the reason."""
+        """Run until the bag ends, a user ends the graph or a node cannot start (reason: :attr:`failure`)."""
         handlers = {number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
         handlers[signal.SIGHUP] = signal.signal(signal.SIGHUP, self._on_signal)
         begin = time.monotonic()
@@ -409,7 +409,7 @@ class Supervisor:
         child.due = now + BACKOFFS[min(child.deaths, len(BACKOFFS)) - 1]
         child.restarts += 1
         child.died = now
-        if playing and monitor.clock_ns and not self.options["loop"]:  # a loop begins where it began
+        if playing and monitor.clock_ns and not self.options["loop"]:  # a looped bag restarts at its given offset
             child.parameters["start_offset"] = max(0.0, (monitor.clock_ns - self._bag_start_ns) / NANOSECONDS)
         how = f"killed by signal {-code}" if code < 0 else f"exit code {code}"
         self.console.line(f"{child.spec.name} died ({how}); starting it again", error=True)
@@ -550,7 +550,7 @@ def _sensors_there(namespace: str) -> Mapping[str, Value]:
 
 
 def flags(options: Mapping[str, Value]) -> Iterator[str]:
-    """As on a command line."""
+    """Options as on a command line."""
     for name, value in options.items():
         values = value if isinstance(value, tuple) and name != "sensors" else (value,)
         for each in values:
@@ -574,7 +574,7 @@ def supervise(
     found: Mapping[str, Value] = MappingProxyType({}),
     settings: Mapping[str, Mapping[str, Value]] = MappingProxyType({}),
 ) -> Supervisor:
-    """Run a graph to its end; returns what ran it.
+    """Run a graph to its end; returns its supervisor.
 
     Args:
         args: the command line.

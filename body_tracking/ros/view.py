@@ -32,11 +32,11 @@ _NOT_HERE: Final = ("bag", "loop", "start", "record", "external", "viewer")
 """Options of ``up`` that are chosen on the page."""
 _PORT: Final = 8080
 _PERIOD_S: Final = 0.5
-"""Between two looks at the ROS domain."""
+"""Seconds between two checks of the ROS domain."""
 _FOLDER_S: Final = 5.0
-"""Between two looks at the folder."""
+"""Seconds between two checks of the folder."""
 _SEEN_S: Final = 0.7
-"""For the browsers to show that a graph starts, before the page is closed."""
+"""Seconds for the browsers to show that a graph starts, before the page is closed."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _viewer_parameters(args: argparse.Namespace) -> Mapping[str, Value]:
-    """Those of the viewer in the parameters file, if there is one."""
+    """The viewer's parameters in the parameters file, if there is one."""
     options = options_of(namespace=names.check_namespace(args.namespace or "/"))
     viewer = NodeSpec("viewer", "viewer", str(options["namespace"]))
     return parameters_for([viewer], args.params_file, None, all_nodes_for(options))["viewer"]
@@ -166,7 +166,7 @@ def _recordings(args: argparse.Namespace, known: dict[Path, Any]) -> Iterator[An
 
 
 def _described(args: argparse.Namespace, bag: Path, where: str) -> Any:
-    """A recording in words, and why it cannot be played."""
+    """A recording in words, or the reason why it cannot be played."""
     from body_tracking.viewing.start_page import DEFAULT, Choice, Recording
 
     try:
