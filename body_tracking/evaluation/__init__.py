@@ -4,10 +4,10 @@
 ``plug_in_gait`` markers; ``comparison`` computes; ``report`` writes, ``pictures`` draws; ``show`` and ``evaluate`` are
 the commands.
 
-By a recording of the marker system: ``estimated_segments`` and ``marker_reference`` read, ``hand_eye`` finds mountings,
-world and clock, ``reference_comparison`` compares half against half, ``reference_error`` takes the reference's own
-deviation off, ``reference_report`` writes.
+Evaluation by a recording of the marker system: ``estimated_segments`` and ``marker_reference`` read, ``hand_eye``
+estimates mountings, world and clock, ``reference_comparison`` compares each half with the fit of the other,
+``reference_error`` removes the reference's own deviation, ``reference_report`` writes.
 
-The thesis's baseline tests: ``balls`` finds balls in images, ``robot_arm`` and ``pendulum`` compute,
+Baseline tests of the thesis: ``balls`` detects balls in images, ``robot_arm`` and ``pendulum`` compute,
 ``baseline_reading`` reads bags, ``baseline`` is the command.
 """

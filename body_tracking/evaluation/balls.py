@@ -1,8 +1,8 @@
-"""Balls in images for the baseline tests: red ones in colour and depth, retro-reflective ones in infrared.
+"""Ball detection for the baseline tests: red balls in colour and depth, retro-reflective balls in infrared images.
 
 Schlagenhauf 2017, section 4.1.1: a filter of red, a binary image, detection of circles, and the depth at the centroid
-(figure 4.4). A retro-reflective ball (section 4.1.2) sends back so much of the camera's own light that a time-of-flight
-camera measures no depth there, which tells it from other bright things.
+(figure 4.4). A retro-reflective ball (section 4.1.2) returns so much of the camera's own light that a time-of-flight
+camera measures no depth there, which distinguishes it from other bright objects.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from body_tracking.markers.detection import detect
 from body_tracking.markers.spheres import sphere_centre_correction
 
 _HUE: Final = 8
-"""Largest distance of a red pixel's hue from red, of OpenCV's 180 steps of the circle."""
+"""Largest distance of a red pixel's hue from red, in OpenCV's 180 steps of the circle."""
 _SATURATION, _VALUE = 110, 40
-"""Least of a red pixel, of 255: also where the ball is in its own shade. Chosen on rendered images."""
+"""Least saturation and value of a red pixel, of 255; also in the ball's own shade. Chosen on rendered images."""
 _LEAST_AREA: Final = 20.0
-"""Pixels of a red region that is looked at."""
+"""Least area of a red region, pixels."""
 _ROUND: Final = 0.8
 """Least share of its smallest enclosing circle that a round region fills; an ellipse fills the ratio of its axes."""
 _SIZES: Final = (0.7, 1.4)
-"""Ratio of a ball's measured radius to its true one."""
+"""Limits of the ratio of a ball's measured radius to its true one."""
 _INNER: Final = 0.6
-"""Share of the ball's radius around its middle in which depth is taken: flying pixels and holes are at its outline."""
+"""Share of the ball's radius within which depth is used: flying pixels and holes are at its outline."""
 _LEAST_DEPTHS: Final = 6
-"""Pixels with depth that a ball needs."""
+"""Least number of pixels with depth on a ball."""
 _LARGEST_HOLE: Final = 0.5
-"""Share of a retro-reflective ball's pixels that may have depth."""
+"""Share of a ball's pixels with depth, below which it is retro-reflective."""
 
 
 class RedBalls(NamedTuple):
@@ -51,12 +51,12 @@ class RedBalls(NamedTuple):
 def red_balls(image: NDArray[np.uint8], depth: SingleArray, colour: Camera, view: Camera, radius: float) -> RedBalls:
     """Centres of red balls (Schlagenhauf 2017, section 4.1.1; figure 4.4): the median depth plus the radius.
 
-    The radius is added along the ray through the middle, pixel by pixel: each pixel with depth gives the distance at
-    which a sphere around that ray would pass through its point. The median is over the pixels near the middle.
+    The radius is added along the ray through the ball's centroid: each pixel with depth gives the distance at which a
+    sphere centred on that ray passes through its point. The median is over the pixels near the centroid.
 
     Args:
         image: (height, width, 3) red, green, blue.
-        depth: metres, 0 where missing, registered to the colour image; any size.
+        depth: metres, 0 where missing, registered to the colour image; of any size.
         colour: intrinsics of the colour image.
         view: intrinsics of the depth image, with the same optical centre.
         radius: of the balls, metres.
@@ -69,7 +69,7 @@ def red_balls(image: NDArray[np.uint8], depth: SingleArray, colour: Camera, view
     centres, without_depth = [], 0
     for outline in outlines:
         moments = cv2.moments(outline)
-        # the outline goes through pixels' centres: by Pick's theorem these are the pixels on and in it
+        # the outline passes through pixel centres: by Pick's theorem this is the number of pixels on and inside it
         area = moments["m00"] + 0.5 * len(outline) + 1.0
         if area < _LEAST_AREA or not moments["m00"] > 0.0:
             continue
@@ -96,7 +96,7 @@ def _ray(camera: Camera, pixel: FloatArray) -> FloatArray:
 
 
 def _distance(depth: SingleArray, view: Camera, ray: FloatArray, size: float, radius: float) -> float | None:
-    """Metres along a ray to the centre of a ball of a size in radians; None without enough depth on it."""
+    """Metres along a ray to the centre of a ball of angular radius ``size``; None without enough depth on it."""
     middle = view.project(ray)
     reach = size * float(view.matrix[0, 0])
     rows, columns = np.mgrid[
@@ -120,9 +120,9 @@ class BrightBalls(NamedTuple):
     """Bright balls in an infrared image.
 
     Attributes:
-        pixels: (k, 2) centroids of those without depth.
+        pixels: (k, 2) centroids of balls without depth.
         radii: (k,) pixels.
-        with_depth: number of those with depth, which are not retro-reflective.
+        with_depth: number of balls with depth, which are not retro-reflective.
     """
 
     pixels: FloatArray
@@ -131,11 +131,11 @@ class BrightBalls(NamedTuple):
 
 
 def bright_balls(infrared: NDArray[Any], depth: SingleArray) -> BrightBalls:
-    """Retro-reflective balls (Schlagenhauf 2017, section 4.1.2; figure 4.9): bright, and without depth.
+    """Detect retro-reflective balls (Schlagenhauf 2017, section 4.1.2; figure 4.9): bright regions without depth.
 
     Args:
         infrared: (height, width) brightness of 8 or 16 bits.
-        depth: (height, width) metres of the same camera, 0 where missing.
+        depth: (height, width) metres, from the same camera, 0 where missing.
     """
     found = detect(infrared)
     radii = np.sqrt(found.areas / np.pi)

@@ -1,4 +1,4 @@
-"""``body_tracking evaluate baseline``: how well a camera tracks a robot arm's red balls, and a pendulum's frequency.
+"""``body_tracking evaluate baseline``: a camera's errors on a robot arm's red balls, and a pendulum's frequency.
 
 The tests of chapter 4.1 of Schlagenhauf 2017: table 4.1 and figure 4.10.
 """
@@ -32,7 +32,7 @@ from body_tracking.evaluation.robot_arm import ArmResult, compare
 _CSV: Final = (".csv", ".csv.gz")
 _AXES: Final = ("X", "Y", "Z")
 _GAP: Final = 0.15
-"""Seconds without a position from which on a curve is interrupted."""
+"""Seconds without a position above which a curve is interrupted."""
 
 
 class Pendulum(NamedTuple):
@@ -40,11 +40,11 @@ class Pendulum(NamedTuple):
 
     Attributes:
         name: of its recording.
-        length: metres; NaN where it is not stated.
-        theory: Hz, for the length.
+        length: metres; NaN if not stated.
+        theory: theoretical frequency for the length, Hz.
         swing: fitted to the images.
         times: (n,) s.
-        measured: (n,) sines of its angle.
+        measured: (n,) sines of the pendulum's angle.
     """
 
     name: str

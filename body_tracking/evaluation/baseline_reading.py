@@ -30,11 +30,11 @@ from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BAG_WIRE, deserialize
 
 _TOLERANCE_NS: Final = NANOSECONDS // 50
-"""By which the stamps of two images of one time may differ."""
+"""Largest difference between the stamps of two simultaneous images."""
 _KEPT: Final = 30
-"""Images that wait for the other one of their time."""
+"""Largest number of images kept for their counterparts."""
 _MOST: Final = 0.5
-"""Share of the images from which on a test can be made of them."""
+"""Least share of usable images for a test."""
 
 _Image = tuple[int, NDArray[Any]]
 """Stamp in nanoseconds, pixels."""
@@ -46,7 +46,7 @@ class PendulumTrack:
 
     Attributes:
         times: (n,) s after the first image, by the stamps.
-        points: (n, 2) ideal image coordinates x/z and y/z; NaN where there is not one ball.
+        points: (n, 2) undistorted image coordinates x/z and y/z; NaN unless exactly one ball is detected.
     """
 
     times: FloatArray
@@ -54,7 +54,7 @@ class PendulumTrack:
 
 
 def _source(bag: RigReader, path: Path, choices: Mapping[str, Codec]) -> tuple[str, Codec]:
-    """The first of some topics that a bag has."""
+    """The first of some topics that exists in a bag."""
     for topic, codec in choices.items():
         if topic in bag.topics:
             if bag.topics[topic].type_name != codec.type_name:
@@ -66,7 +66,7 @@ def _source(bag: RigReader, path: Path, choices: Mapping[str, Codec]) -> tuple[s
 
 
 def _decoded(path: Path, topic: str, codec: Codec, cdr: bytes) -> Any:
-    """The payload of a message; EvaluationError with path and topic for one that cannot be used."""
+    """The payload of a message; raises EvaluationError with path and topic for an unusable one."""
     try:
         return codec.decode(cdr, BAG_WIRE)
     except MessageError as error:
@@ -86,7 +86,7 @@ def _camera(bag: RigReader, path: Path, topic: str) -> Camera:
 def _pairs(
     bag: RigReader, path: Path, image: tuple[str, Codec], depth: tuple[str, Codec]
 ) -> Iterator[tuple[int, NDArray[Any], SingleArray]]:
-    """Stamps in nanoseconds and images of one time, with progress on stderr."""
+    """Stamps in nanoseconds and simultaneous images, with progress on stderr."""
     waiting: tuple[deque[_Image], deque[_Image]] = deque(), deque()
     sides = {image[0]: (waiting[0], image[1]), depth[0]: (waiting[1], depth[1])}
     progress = Progress(0, sum(bag.topics[topic].count for topic in sides))
@@ -101,9 +101,9 @@ def _pairs(
 
 
 def _matched(images: deque[_Image], depths: deque[_Image]) -> Iterator[tuple[int, NDArray[Any], SingleArray]]:
-    """Take the images out whose depth images are known, as none nearer in time will come; both are in order of stamps.
+    """Remove and yield image pairs whose depth image is certain; both queues are in order of stamps.
 
-    The tolerance may be longer than the time between two images, so that the nearest ones belong together.
+    The tolerance may exceed the frame interval, so that the nearest images must be matched.
     """
     while images and depths and depths[-1][0] >= images[0][0]:
         stamp_ns, pixels = images.popleft()
@@ -120,7 +120,7 @@ def _matched(images: deque[_Image], depths: deque[_Image]) -> Iterator[tuple[int
 
 
 def _check_size(path: Path, topic: str, image: NDArray[Any], camera: Camera) -> None:
-    """Raise EvaluationError for an image that has not the size for which its camera is calibrated."""
+    """Raise EvaluationError for an image whose size differs from its camera's calibration."""
     height, width = image.shape[:2]
     if (width, height) != (camera.width, camera.height):
         raise EvaluationError(
@@ -135,11 +135,11 @@ def read_arm(path: Path, topics: CameraTopics, balls_topic: str, diameter: float
     Args:
         path: of the bag.
         topics: of the camera; images may be compressed by image_transport.
-        balls_topic: on which the robot states where its balls are.
+        balls_topic: of the balls' positions stated by the robot.
         diameter: of the balls, metres.
 
     Raises:
-        BagError: no readable bag.
+        BagError: the bag is unreadable.
         EvaluationError: a topic is missing, or most images do not show three red balls with depth.
     """
     with RigReader(path) as bag:
@@ -170,7 +170,7 @@ def read_arm(path: Path, topics: CameraTopics, balls_topic: str, diameter: float
 
 
 def _check_numbers(path: Path, numbers: Counter[int], without: int) -> None:
-    """Raise EvaluationError where most images do not show three red balls."""
+    """Raise EvaluationError unless most images show three red balls."""
     images = numbers.total()
     if not images:
         raise EvaluationError(f"{path}: no colour and depth images of one time")
@@ -206,10 +206,10 @@ def _robot(bag: RigReader, path: Path, topic: str) -> tuple[FloatArray, FloatArr
 
 
 def read_pendulum(path: Path, infrared: str, depth: str) -> PendulumTrack:
-    """The ball of a pendulum in a bag of infrared and depth images of one camera.
+    """The ball of a pendulum in a bag of infrared and depth images from one camera.
 
     Raises:
-        BagError: no readable bag.
+        BagError: the bag is unreadable.
         EvaluationError: a topic is missing, or most images do not show one retro-reflective ball.
     """
     numbers, bright = Counter[int](), 0

@@ -1,4 +1,4 @@
-"""``body_tracking compare``: every system that recorded a person against every other one."""
+"""``body_tracking compare``: pairwise comparison of all systems that recorded a person."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ Side = EstimatedSegments | MarkerReference
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """The differences of two systems; radians.
+    """The differences between two systems; radians.
 
     Attributes:
-        angles: by name, of those that both know.
-        measured: RMS difference of all of these.
-        covered: share of all within 1.96 of the deviations that both state.
+        angles: by name, of angles known to both.
+        measured: RMS difference of all these angles.
+        covered: share of the differences within 1.96 standard deviations, combined from both.
     """
 
     angles: Mapping[str, Judged]
@@ -47,7 +47,7 @@ class Pair:
 
 
 def read_side(path: Path) -> Side:
-    """A recording of one system: the segments and angles that the graph computed, or poses of infrared targets.
+    """A recording of one system: segments and angles computed by the graph, or poses of infrared targets.
 
     Raises:
         BagError: no such bag, or it is unreadable.
@@ -63,7 +63,7 @@ def compare_pair(one: Side, other: Side) -> Pair:
     """Compare two systems.
 
     Raises:
-        EvaluationError: two recordings of the marker system, too little overlap, or nothing that both know.
+        EvaluationError: two recordings of the marker system, too little overlap, or no angle known to both.
     """
     if isinstance(one, MarkerReference):
         one, other = other, one
@@ -84,18 +84,18 @@ def compare_pair(one: Side, other: Side) -> Pair:
 
 
 def known_shares(side: Side, seconds: float) -> dict[str, float]:
-    """By angle the share of so many seconds in which the system states it to :data:`USABLE`; empty for targets."""
+    """By angle, the share of the duration with a stated deviation below :data:`USABLE`; empty for targets."""
     if isinstance(side, MarkerReference):
         return {}
     angles = side.angles
-    # until the next frame, which a system that has lost the person does not have for long
+    # each frame counts until the next one, at most MAX_GAP, because a system without the person has long gaps
     steps = np.minimum(np.diff(angles.stamps_ns) / NANOSECONDS, MAX_GAP)
     shares = np.minimum(steps @ (angles.stddev[:-1] < USABLE) / seconds, 1.0)
     return dict(zip(angles.names, shares.tolist(), strict=True))
 
 
 def report_of(sides: Mapping[str, Side]) -> Report:
-    """The tables of all pairs, and of every angle against the truth where there is a side of that name.
+    """The tables of all pairs, and of every angle against the truth if there is a side of that name.
 
     Args:
         sides: two or more, by name.
@@ -199,14 +199,14 @@ def replay_systems(bag: Path, systems: Mapping[str, list[str]], output: Path, *,
     """Replay a recording once with each system, each into a folder of its name.
 
     Raises:
-        EvaluationError: arguments that replay does not take.
-        BodyTrackingError: as of replay.
+        EvaluationError: arguments that replay does not accept.
+        BodyTrackingError: as replay.
     """
     parser = argparse.ArgumentParser(exit_on_error=False)
     replay.add_parser(parser.add_subparsers())
     options = ["--overwrite"] if overwrite else []
     parsed = {}
-    for name, arguments in systems.items():  # all before the first is replayed
+    for name, arguments in systems.items():  # check all arguments before the first replay
         try:
             given = ["replay", str(bag), "-o", str(output / name), *options, *arguments]
             parsed[name], unknown = parser.parse_known_args(given)

@@ -1,4 +1,4 @@
-"""Compares a recorded person with the truth by all metrics of ``metrics``."""
+"""Compares a recorded person with the truth by the metrics of ``metrics``."""
 
 from __future__ import annotations
 
@@ -43,15 +43,15 @@ from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
 
 AS_IT_IS, ALIGNED = "as it is", "aligned"
 MAX_GAP = 0.15
-"""Samples farther apart have a gap between them, seconds."""
+"""Seconds between samples above which there is a gap."""
 BEYOND = 0.15
-"""A joint farther from the truth is off track, metres."""
+"""Distance from the truth above which a joint is off track, metres."""
 WINDOW = 0.5
 """Half width of the search for the delay, seconds."""
 
 _TRACKED = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
 _SHOWN = np.broadcast_to(0.01**2 * np.eye(3), (N_JOINTS, 3, 3))
-"""True angles that 10 mm of noise in every joint would make unknown, as the plane of a hanging arm, do not count."""
+"""True angles that 10 mm of noise in every joint would make unknown, e.g. the plane of a hanging arm, are ignored."""
 _COARSE_RATE, _COARSE_WINDOW = 30.0, 1.5
 
 
@@ -61,10 +61,10 @@ class AngleComparison:
 
     Attributes:
         names: m names.
-        times: (n,) s in the truth's time.
+        times: (n,) s on the truth's clock.
         found: (n, m) radians.
         true: (n, m) radians; NaN where the true pose does not determine the angle.
-        stddev: (n, m) radians, infinity where none is stated.
+        stddev: (n, m) radians, infinity if not stated.
         errors: of ``found``.
     """
 
@@ -83,13 +83,13 @@ class Comparison:
     Attributes:
         name: :data:`AS_IT_IS` or :data:`ALIGNED`.
         alignment: applied to the estimate.
-        times: (n,) s in the truth's time.
+        times: (n,) s on the truth's clock.
         found: (n, 25, 3) metres.
         true: (n, 25, 3) metres.
         joints: errors of ``found``.
-        off_track: (25,) share of the truth's frames from the first estimate on; NaN for joints without estimates.
+        off_track: (25,) share of the truth's frames after the first estimate; NaN for joints without estimates.
         positional: the angles of ``kinematics.positional`` of both skeletons.
-        named: the estimate's own angles that the truth has too; None for none.
+        named: the estimate's own angles that the truth also has; None if there are none.
     """
 
     name: str
@@ -110,7 +110,7 @@ class SensorErrors:
     Attributes:
         sensor: its name.
         times: (n,) s at which poses were published.
-        poses: errors of these.
+        poses: errors of these poses.
         clock_times: (c,) s.
         clock: (c,) s, estimated minus true offset.
     """
@@ -129,13 +129,13 @@ class Evaluation:
     Attributes:
         estimate: the evaluated recording.
         truth: its reference.
-        span: (first, last) s in the truth's time, covered by both.
-        delay: s by which the estimate follows the truth; NaN where it is not observable.
-        comparisons: as it is (where clock and frame are shared), and aligned.
+        span: (first, last) s on the truth's clock, covered by both.
+        delay: s by which the estimate lags the truth; NaN if unobservable.
+        comparisons: as it is (if clock and frame are shared), and aligned.
         jitter: (25,) metres.
         lengths: of the bones.
-        calibration: of each sensor but the one that defines world.
-        notes: omissions, a line each.
+        calibration: of each sensor except the one that defines the world frame.
+        notes: omissions, one per line.
     """
 
     estimate: Recorded
@@ -160,7 +160,7 @@ def evaluate(
     Args:
         estimate: of one person.
         truth: of the same person.
-        own_clock: the truth has a clock and a frame of its own: compare aligned only.
+        own_clock: whether the truth has a clock and a frame of its own: then compare aligned only.
         progress: called with the completed share, from 0 to 1.
 
     Raises:
@@ -223,10 +223,10 @@ def evaluate(
 
 
 def _notes(estimate: Recorded, truth: Recorded) -> list[str]:
-    """Notes on what cannot be compared.
+    """Notes on data that cannot be compared.
 
     Raises:
-        EvaluationError: nothing can be compared.
+        EvaluationError: no joint is known in both.
     """
     mine, theirs = estimate.joints, truth.joints
     if not (mine & theirs).any():
@@ -250,7 +250,7 @@ def _joints(which: BoolArray) -> str:
 
 
 def _span(times: FloatArray, truth: tuple[float, float], estimate: Recorded, true: Recorded) -> tuple[float, float]:
-    """The common time span, s in the truth's time."""
+    """The common time span, s on the truth's clock."""
     first, last = max(float(times[0]), truth[0]), min(float(times[-1]), truth[1])
     if not last > first:
         spans = (
@@ -265,9 +265,9 @@ def _span(times: FloatArray, truth: tuple[float, float], estimate: Recorded, tru
 
 
 def _own_clock_offset(whole: Trajectory, curve: Curve, estimate: Recorded, truth: Recorded) -> float:
-    """The estimate's time less the truth's, each from its first frame, by the speeds of the joints.
+    """Estimate's time minus truth's, each from its first frame, by correlation of the joints' speeds.
 
-    These need no common frame. At least half of the shorter recording must overlap.
+    Speeds need no common frame. At least half of the shorter recording must overlap.
     """
     first, last = curve.span
     times = grid(first, last, _COARSE_RATE)
@@ -322,8 +322,8 @@ def _compare(
             f"{estimate.source} knows {known(own.positions).mean():.0%} of the positions there, "
             f"{truth.source} {known(curve.at(own.times)).mean():.0%}"
         )
-    # From the first estimate on every frame of the truth counts, including those without estimate; after the last
-    # estimate only where both share a clock.
+    # After the first estimate every frame of the truth counts, including frames without estimate; after the last
+    # estimate only if both share a clock.
     all_times = truth.seconds(int(truth.stamps_ns[0]))
     lost = (all_times > last + MAX_GAP) & (not own_clock)
     counted = all_times[(all_times >= moved.times[0]) & ((all_times <= last) | lost)]
@@ -342,7 +342,7 @@ def _compare(
 
 
 def _positional(found: Trajectory, curve: Curve) -> AngleComparison:
-    """The angles of both skeletons at the estimate's own instants."""
+    """The angles of both skeletons at the estimate's instants."""
     mine, stddev = skeleton_angles(found.positions, found.covariances)
     positions = curve.at(found.times)
     true, shown = skeleton_angles(positions, np.broadcast_to(_SHOWN, (len(positions), *_SHOWN.shape)))
@@ -355,7 +355,7 @@ def skeleton_angles(positions: FloatArray, covariances: FloatArray | None = None
 
     Args:
         positions: (n, 25, 3) metres, z up, NaN where unknown.
-        covariances: (n, 25, 3, 3) square metres; None where none are stated.
+        covariances: (n, 25, 3, 3) square metres; None if not stated.
 
     Returns:
         (n, 13) radians, NaN where unknown, and their standard deviations, infinite where unknown.
@@ -376,7 +376,7 @@ def _named(
     moved: Trajectory,
     zero_ns: int,
 ) -> AngleComparison | None:
-    """The angles with the same names in both; frame-dependent angles are not transformed by the alignment."""
+    """The angles with common names; the alignment does not transform frame-dependent angles."""
     mine = estimate.angles
     if mine is None or theirs is None:
         return None
@@ -392,7 +392,7 @@ def _named(
 
 
 def _unwrapped(angles: FloatArray) -> FloatArray:
-    """(n, m) angles without jumps by whole turns; NaN stays NaN."""
+    """(n, m) angles without jumps by full turns; NaN stays NaN."""
     unwrapped = np.full_like(angles, np.nan)
     for column in range(angles.shape[1]):
         there = np.isfinite(angles[:, column])
@@ -401,7 +401,7 @@ def _unwrapped(angles: FloatArray) -> FloatArray:
 
 
 def _calibration(estimate: Recorded, truth: Recorded, zero_ns: int) -> tuple[SensorErrors, ...]:
-    """Errors of the sensors known in both, without the one that defines world."""
+    """Errors of the sensors known in both, without the one that defines the world frame."""
     base = truth.positions[:, Joint.SPINE_BASE if truth.joints[Joint.SPINE_BASE] else int(truth.joints.argmax())]
     place = base[known(base)].mean(axis=0)
     found = []

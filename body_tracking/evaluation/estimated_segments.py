@@ -1,4 +1,4 @@
-"""Orientations of a person's segments in a recording, and joint angles as rotations of pairs of segments."""
+"""Segment orientations of a person in a recording, and joint angles as rotations between pairs of segments."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ class EstimatedSegments:
 
     Attributes:
         source: the bag or file.
-        topic: where the orientations come from.
+        topic: source of the orientations.
         stamps_ns: (n,) capture times, increasing, nanoseconds.
-        rotations: (n, 12, 3, 3) in the order of ``SEGMENTS``: a segment's vectors to world.
+        rotations: (n, 12, 3, 3) segment to world, in the order of ``SEGMENTS``.
         angles: in one of ``CONVENTIONS``.
         convention: of the angles.
-        warnings: a line each.
+        warnings: one per line.
     """
 
     source: Path
@@ -56,12 +56,12 @@ class EstimatedSegments:
 
     @property
     def seconds(self) -> FloatArray:
-        """(n,) s since the first instant."""
+        """(n,) s after the first instant."""
         seconds: FloatArray = (self.stamps_ns - self.stamps_ns[0]) / NANOSECONDS
         return seconds
 
     def track(self, rotations: FloatArray) -> Track:
-        """Rotations (n, 3, 3) at the own instants; those at which one is unknown are absent."""
+        """Track of rotations (n, 3, 3) at the own instants; unknown ones are left out."""
         whole = np.isfinite(rotations).all(axis=(-1, -2))
         return Track(self.seconds[whole], rotations[whole], np.zeros((int(whole.sum()), 3, 3)))
 
@@ -69,13 +69,13 @@ class EstimatedSegments:
 def read_segments(path: Path, topic: str | None = None, body: str | None = None) -> EstimatedSegments:
     """The estimated segments and angles in a bag.
 
-    The orientations are those of ``/filtered/model_state``, which the filter ``ekf`` publishes. Without it, or where a
-    topic is given, they are those of the body model that is fitted to the skeletons, as ``joint_angles`` does.
+    The orientations come from ``/filtered/model_state``, published by the filter ``ekf``. Without it, or if a topic is
+    given, they come from the body model fitted to the skeletons, as in ``joint_angles``.
 
     Args:
         path: a bag folder or an mcap file.
-        topic: of skeletons; where None ``/filtered/skeleton``, or ``/fused/skeleton`` where that is missing.
-        body: whose angles; the first in the bag where None.
+        topic: of skeletons; None for ``/filtered/skeleton``, or ``/fused/skeleton`` if that is missing.
+        body: id of the person whose angles are read; None for the first in the bag.
 
     Raises:
         BagError: no such bag, or it is unreadable.
@@ -134,13 +134,13 @@ def read_segments(path: Path, topic: str | None = None, body: str | None = None)
 
 
 def read_true_segments(path: Path) -> EstimatedSegments | None:
-    """The true segments and angles, of the convention ``model`` and with deviations of zero, in a simulated bag.
+    """The true segments and angles in a simulated bag; convention ``model``, standard deviations zero.
 
     Raises:
         BagError: no such bag, or it is unreadable.
 
     Returns:
-        None without a true state of the model.
+        The segments; None without a true state of the model.
     """
     model = UpperBody()
     with RigReader(path) as bag:
@@ -165,16 +165,16 @@ def _convention_of(names: tuple[str, ...], model: UpperBody) -> str | None:
 
 
 def joint_chains(name: str, mounted: frozenset[str], model: UpperBody) -> tuple[Chain, ...]:
-    """The joint angles of a convention that are rotations between two of some segments.
+    """The joint angles of a convention that are rotations between two of the mounted segments.
 
     Args:
         name: one of ``CONVENTIONS``.
-        mounted: names of segments.
+        mounted: names of segments with a target.
         model: the body.
 
     Returns:
-        Chains between segments; those of the convention, and one for each joint whose angles are coordinates of the
-        model. Their third axis, which the model does not have, has no name.
+        Chains between segments: those of the convention, and one for each joint whose angles are coordinates of the
+        model. A third axis that the model does not have has no name.
     """
     found = convention(name, model)
     chains = [
@@ -186,7 +186,7 @@ def joint_chains(name: str, mounted: frozenset[str], model: UpperBody) -> tuple[
         parent = model.parents[segment]
         if parent < 0 or not set(names) & set(found.names) or not {SEGMENTS[parent], SEGMENTS[segment]} <= mounted:
             continue
-        # all frames are aligned in the neutral pose, where the axes of the joint are those of its coordinates
+        # in the neutral pose all frames are aligned, and the joint's axes are those of its coordinates
         axes = np.rint(neutral.rotation_jacobian[segment][:, where].T)
         if len(axes) == 2:
             sequence = EulerAngles((axes[0], np.cross(axes[1], axes[0]), axes[1]), (_ANY, _MIDDLE, _ANY))
@@ -198,7 +198,7 @@ def joint_chains(name: str, mounted: frozenset[str], model: UpperBody) -> tuple[
 
 
 def split_near(chain: Chain, rotations: FloatArray, near: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Angles of a chain over time, of the equivalent triples those nearest to others.
+    """Angles of a chain over time: among equivalent triples, those nearest to given ones.
 
     Args:
         chain: the joint.
@@ -208,6 +208,6 @@ def split_near(chain: Chain, rotations: FloatArray, near: FloatArray) -> tuple[F
     Returns:
         (n, 3) radians and (n, 3, 3) their derivatives by a rotation in the parent's frame.
     """
-    # one sequence, which all instants share
+    # one sequence for all instants
     split = EulerSequences([chain.angles]).split(rotations, np.zeros((len(rotations), 3)), near)
     return split.angles, split.gradients

@@ -1,4 +1,4 @@
-"""``body_tracking evaluate``: errors against the truth in a few lines, as tables, JSON and a page with pictures."""
+"""``body_tracking evaluate``: errors against the truth as a summary, tables, JSON and a page with pictures."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from body_tracking.recording.rig import RigReader
 
 
 def truth_from(args: argparse.Namespace) -> tuple[Recorded, bool]:
-    """The truth from a bag or a C3D file, and whether its clock and frame are its own.
+    """The truth from a bag or a C3D file, and whether it has its own clock and frame.
 
     Raises:
         BagError: neither a C3D file nor a readable bag.
@@ -105,8 +105,8 @@ def _by_markers(args: argparse.Namespace) -> bool:
     """Whether the truth is a recording of the marker system.
 
     Raises:
-        BagError: the truth is no readable bag.
-        EvaluationError: an option for such recordings was given with another truth, or the other way round.
+        BagError: the truth is not a readable bag.
+        EvaluationError: an option for marker recordings was given with another kind of truth.
     """
     found = False
     if args.truth is not None and args.truth.suffix.lower() != ".c3d":
@@ -123,7 +123,7 @@ def _by_markers(args: argparse.Namespace) -> bool:
 
 
 def _by_estimate(args: argparse.Namespace) -> bool:
-    """Whether the truth is a bag that has estimates and no ground truth."""
+    """Whether the truth is a bag with estimates and without ground truth."""
     if args.truth is None or args.truth.suffix.lower() == ".c3d":
         return False
     with RigReader(args.truth) as bag:

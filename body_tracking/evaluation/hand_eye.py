@@ -1,7 +1,7 @@
-"""Targets of a reference system on the segments of an estimated body: mountings, common world and clock.
+"""Hand-eye calibration of a reference system's targets on the segments of an estimated body: mountings, world, clock.
 
-Each target t is fixed on one segment. With the segment's estimated orientation A (segment to world), the target's
-measured one B (target to rig), the mounting X (target to segment) and the rig's orientation Z (rig to world)
+Each target t is fixed on one segment. The segment's estimated orientation A (segment to world), the target's measured
+orientation B (target to rig), the mounting X (target to segment) and the rig's orientation Z (rig to world) satisfy
 
     A_t(s) X_t = Z B_t(s + offset + drift (s - middle))                                                             (1)
 
@@ -16,10 +16,10 @@ is bilinear in vec Z and vec X, so that the largest singular vector of the stack
 
     r = log((Z B X^T)^T A)                                                                                          (2)
 
-with the scatter of the estimate's errors S_t, estimated from the residuals, plus the target's own covariance. Outliers
-are downweighted as by a multivariate Student distribution (Lange, Little and Taylor, J. Am. Stat. Assoc. 84 (1989)
-881). Errors of a tracker are correlated over time, so the variance of a target's scores is multiplied by the number
-of samples per independent sample: the integral of the autocorrelation of its residuals.
+with the scatter S_t of the estimate's errors, estimated from the residuals, plus the target's own covariance. Outliers
+are downweighted by a multivariate Student distribution (Lange, Little and Taylor, J. Am. Stat. Assoc. 84 (1989) 881).
+A tracker's errors are correlated over time, so the variance of a target's scores is multiplied by the number of samples
+per independent sample: the integral of the autocorrelation of its residuals.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
 from body_tracking.markers.joints import ONE_AXIS, SMALL_MOTION
 
 MAX_GAP: Final = 0.1
-"""Seconds between samples of a target over which its orientation is interpolated."""
+"""Longest time between a target's samples for interpolation of its orientation, seconds."""
 MIN_SAMPLES: Final = 60
-"""Instants at which a segment and its target must both be known: 2 s of a camera at 30 Hz."""
+"""Least number of instants with both a segment and its target: 2 s of a camera at 30 Hz."""
 _FREEDOM: Final = 5.0
 """Degrees of freedom of the Student distribution: 5 keeps 91 % of the efficiency for normal errors."""
 _MEDIAN_3: Final = 2.366
@@ -47,11 +47,11 @@ _MEDIAN_3: Final = 2.366
 _LEAST_SCATTER: Final = np.radians(0.05) ** 2
 _ITERATIONS, _CONVERGED = 60, 1e-6
 _FARTHEST: Final = 0.15
-"""Seconds by which the fit may move the clock from its start."""
+"""Largest correction of the clock by the fit, seconds."""
 
 
 class HandEyeError(BodyTrackingError):
-    """The motion does not determine mountings and world."""
+    """Raised if the motion does not determine mountings and world."""
 
 
 class Sampled(NamedTuple):
@@ -83,7 +83,7 @@ class Track:
     covariances: FloatArray
 
     def at(self, times: FloatArray, max_gap: float = MAX_GAP) -> Sampled:
-        """Interpolated along the shortest rotation between two samples at most ``max_gap`` seconds apart."""
+        """Interpolation along the shortest rotation between two samples at most ``max_gap`` seconds apart."""
         if len(self.times) < 2:
             count = len(times)
             zeros = np.zeros((count, 3, 3))
@@ -97,13 +97,13 @@ class Track:
         start = self.rotations[before]
         turn = so3.rotation_vectors(start.swapaxes(-1, -2) @ self.rotations[after])
         rotations = np.where(known[:, None, None], start @ so3.quat_to_matrix(so3.exp(share * turn)), np.eye(3))
-        # two samples with independent noise: their mixture has less
+        # interpolating two samples with independent noise reduces the variance
         mixed = (1.0 - share[..., None]) ** 2 * self.covariances[before]
         mixed = mixed + share[..., None] ** 2 * self.covariances[after]
         return Sampled(rotations, mixed, known)
 
     def rates(self, times: FloatArray, span: float = 2.0 * MAX_GAP) -> FloatArray:
-        """(n, 3) rad/s about the own axes: the rotation over ``span`` seconds around each time; NaN where unknown."""
+        """(n, 3) rad/s about the own axes, from the rotation over ``span`` seconds around each time; NaN if unknown."""
         start, end = self.at(times - 0.5 * span), self.at(times + 0.5 * span)
         turn = so3.rotation_vectors(start.rotations.swapaxes(-1, -2) @ end.rotations) / span
         result: FloatArray = np.where((start.known & end.known)[:, None], turn, np.nan)
@@ -112,11 +112,11 @@ class Track:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mounting:
-    """A target's orientation on its segment, as known before.
+    """A target's orientation on its segment, known beforehand.
 
     Attributes:
         rotation: (3, 3) target to segment.
-        covariance: (3, 3) square radians of w, in the segment's frame, such that the true one is ``exp(w) @ rotation``.
+        covariance: (3, 3) square radians of w in the segment's frame: the true rotation is ``exp(w) @ rotation``.
     """
 
     rotation: FloatArray
@@ -130,13 +130,14 @@ class HandEye:
     Attributes:
         world: (3, 3) Z, rig to world.
         mountings: (k, 3, 3) X, target to segment.
-        clock: (2,) offset in seconds at ``middle``, and drift: target's clock minus that of the estimate.
-        middle: s in the estimate's time.
-        covariance: (3 k + 5, 3 k + 5): of ``w`` per mounting, in its segment's frame, such that the true one is
-            ``exp(w) @ mounting``; of the world likewise, in the world's frame; of the clock. Rows and columns of
-            unfitted parameters are zero.
+        clock: (2,) offset in seconds at ``middle``, and drift: targets' clock minus the estimate's.
+        middle: s on the estimate's clock.
+        covariance: (3 k + 5, 3 k + 5): per mounting of ``w`` in its segment's frame, the true one being
+            ``exp(w) @ mounting``; of the world's ``w`` likewise, in the world's frame; of the clock. Rows and columns
+            of parameters that are not fitted are zero.
         residuals: (n, k, 3) radians, eq. 2; NaN where a segment or its target is unknown.
-        motion: (3,) radians RMS of all targets about the principal axes of their motion in the rig, largest first.
+        motion: (3,) RMS rotation of all targets about the principal axes of their motion in the rig, radians, the
+            largest first.
     """
 
     world: FloatArray
@@ -148,27 +149,27 @@ class HandEye:
     motion: FloatArray
 
     def to_reference(self, times: FloatArray) -> FloatArray:
-        """(n,) s of the estimate's clock in the targets' clock."""
+        """(n,) times on the estimate's clock converted to the targets' clock, s."""
         result: FloatArray = times + self.clock[0] + self.clock[1] * (times - self.middle)
         return result
 
     def mounting_stddev(self, target: int) -> float:
-        """Radians, root of the trace of a mounting's covariance over 3: per axis."""
+        """Standard deviation of a mounting per axis, radians: root of the mean of its variances."""
         return float(np.sqrt(self.covariance.diagonal()[3 * target : 3 * target + 3].mean()))
 
     @property
     def world_stddev(self) -> float:
-        """Radians per axis."""
+        """Standard deviation of the world per axis, radians."""
         return float(np.sqrt(self.covariance.diagonal()[-5:-2].mean()))
 
 
 def closed_form(segments: FloatArray, targets: FloatArray, known: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Z and X of eq. 1 for clocks that agree (Shah 2013, section 3).
+    """Z and X of eq. 1 for equal clocks (Shah 2013, section 3).
 
     Args:
         segments: (n, k, 3, 3) A.
         targets: (n, k, 3, 3) B.
-        known: (n, k) which of both count.
+        known: (n, k) whether both are known.
 
     Returns:
         (3, 3) world and (k, 3, 3) mountings.
@@ -183,13 +184,13 @@ def closed_form(segments: FloatArray, targets: FloatArray, known: BoolArray) -> 
 
 
 def mountings_in(world: FloatArray, segments: FloatArray, targets: FloatArray, known: BoolArray) -> FloatArray:
-    """(k, 3, 3) X of eq. 1 for a given Z; other arguments as of :func:`closed_form`."""
+    """(k, 3, 3) X of eq. 1 for a given Z; other arguments as in :func:`closed_form`."""
     weight = known.astype(np.float64)
     return so3.nearest_rotation(np.einsum("nk,nkca,cd,nkdb->kab", weight, segments, world, targets, optimize=True))
 
 
 def principal_motion(targets: FloatArray, known: BoolArray) -> FloatArray:
-    """(3,) :attr:`HandEye.motion` of orientations (n, k, 3, 3), which are known or not (n, k)."""
+    """(3,) :attr:`HandEye.motion` of orientations (n, k, 3, 3) with mask (n, k)."""
     scatter, count = np.zeros((3, 3)), 0
     for number in range(targets.shape[1]):
         there = targets[known[:, number], number]
@@ -218,11 +219,11 @@ def fit_hand_eye(
         segments: (n, k, 3, 3) A, NaN where unknown.
         targets: k tracks B.
         names: of the k targets.
-        clock: (2,) offset at ``middle`` and drift to begin with, correct to within 0.15 s.
+        clock: (2,) initial offset at ``middle`` and drift, correct to within 0.15 s.
         fit_clock: whether to fit the clock too.
-        middle: s of ``times`` at which the offset is that of ``clock``; the mean time where None.
-        known_mountings: of some targets, by name: their X, which is not fitted. The estimate would pull it to where its
-            own constant errors vanish.
+        middle: s of ``times`` at which the offset holds; None for the mean time.
+        known_mountings: by target, fixed X. If they were fitted, the estimate's constant errors would be absorbed by
+            them.
 
     Raises:
         HandEyeError: too few instants, or a motion that is small or about one axis only.
@@ -237,8 +238,8 @@ class _Normal(NamedTuple):
     """Normal equations.
 
     Attributes:
-        scores: (n, k, p) gradient of the cost at each instant by each target.
-        information: (k, p, p) by each target.
+        scores: (n, k, p) gradient of the cost by instant and target.
+        information: (k, p, p) by target.
         weights: (n, k) of the Student distribution; 0 where unknown.
         distance: (n, k) squared Mahalanobis distance of the residuals.
         known: (n, k).
@@ -280,14 +281,14 @@ class _Fit:
                 self.mountings[number] = known_mountings[name].rotation
 
     def sample(self) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Targets' rotations and covariances at the present clock, and which instants count, (n, k, ...)."""
+        """Targets' rotations and covariances at the present clock, and a mask of known instants, (n, k, ...)."""
         sampled = [target.at(self._at) for target in self.targets]
         rotations, covariances, known = (np.stack(each, axis=1) for each in zip(*sampled, strict=True))
         return rotations, covariances, known & self.seen
 
     @property
     def _at(self) -> FloatArray:
-        """(n,) s in the targets' clock."""
+        """(n,) the estimate's times on the targets' clock, s."""
         at: FloatArray = self.times + self.clock[0] + self.clock[1] * (self.times - self.middle)
         return at
 
@@ -347,9 +348,9 @@ class _Fit:
             )
 
     def _normal(self) -> _Normal:
-        """The normal equations at the present state; updates the scatter."""
+        """Normal equations at the present state; updates the scatter."""
         rotations, covariances, known = self.sample()
-        # without the samples around the instant itself, whose noise is in the residual too
+        # rates exclude the sample at the instant itself, whose noise is in the residual too
         rates = np.stack([target.rates(self._at) for target in self.targets], axis=1)
         residuals = self.residuals(rotations)
         n, k = known.shape
@@ -376,7 +377,7 @@ class _Fit:
         return _Normal(scores, information, weights, distance, known)
 
     def _free(self, fit_clock: bool) -> IntArray:
-        """Indices of what is fitted."""
+        """Indices of the fitted parameters."""
         free = np.ones(self.size, dtype=np.bool_)
         free[:-5] = ~np.repeat(self.fixed, 3)
         free[-2:] = fit_clock
@@ -390,7 +391,7 @@ class _Fit:
     def result(self, fit_clock: bool) -> HandEye:
         """The solution with the sandwich covariance (White 1980).
 
-        The scatter of the scores has what targets' errors have in common, as by the pelvis of which all segments hang.
+        The scatter of the scores includes common errors of the targets, e.g. of the pelvis, the root of all segments.
         """
         normal = self._normal()
         residuals = np.where(normal.known[..., None], self.residuals(self.sample()[0]), np.nan)
@@ -402,7 +403,7 @@ class _Fit:
         information[-1, -1] += DRIFT_PRIOR**-2
         middle[-1, -1] += DRIFT_PRIOR**-2
         inverse = np.linalg.inv(information[np.ix_(free, free)])
-        # an error of a given mounting moves what is fitted
+        # errors of the given mountings propagate to the fitted parameters
         moves = np.eye(self.size)
         moves[np.ix_(free, given)] = -inverse @ information[np.ix_(free, given)]
         covariance = moves @ self.given @ moves.T
@@ -410,9 +411,10 @@ class _Fit:
         return HandEye(self.world, self.mountings, self.clock, self.middle, covariance, residuals, self.motion)
 
     def _factors(self, normal: _Normal, residuals: FloatArray, target: int) -> tuple[float, float]:
-        """Second derivative of a target's cost in units of its information, and samples per independent sample.
+        """Second derivative of a target's cost relative to its information, and samples per independent sample.
 
-        The weights fall where residuals grow, which takes 2/3 of ``w d / (freedom + d)`` off the second derivative.
+        The weights fall with growing residuals, which subtracts 2/3 of ``w d / (freedom + d)`` from the second
+        derivative.
         """
         known = normal.known[:, target]
         weights, distance = normal.weights[known, target], normal.distance[known, target]

@@ -1,4 +1,4 @@
-"""A recording of the marker system as a reference: poses of targets, and which segment each target is mounted on."""
+"""A recording of the marker system as a reference: poses of targets, and the segment of each target."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader
 
 _TOPIC: Final = re.compile(r"/markers/(\w+)/pose")
 _OTHER_NAMES: Final = {"shoulder": "clavicle", "chest": "upper_trunk", "thorax": "upper_trunk"}
-"""Where a target of this name is worn."""
+"""Segments of targets with these names."""
 _LEAST_TARGETS: Final = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MarkerReference:
-    """What the marker system recorded of the targets on a person.
+    """Recording of the marker system of targets on a person.
 
     Attributes:
         source: the bag or file.
-        first_ns: stamp from which the tracks count seconds.
-        tracks: orientation of each target in the rig, by name, with the covariance by the noise of the images.
-        segments: the segment of each target, by name.
-        angles: of the chain of targets; None for none.
-        warnings: a line each.
+        first_ns: stamp of the tracks' time zero, nanoseconds.
+        tracks: by target, its orientation in the rig, with the covariance by the noise of the images.
+        segments: by target, its segment.
+        angles: of the chain of targets; None if there are none.
+        warnings: one per line.
     """
 
     source: Path
@@ -51,7 +51,7 @@ class MarkerReference:
 
     @property
     def angle_stddev(self) -> float:
-        """Radians: the median of the stated deviations of the chain's angles, calibration included; NaN for none."""
+        """Median of the stated standard deviations of the chain's angles, with calibration, radians; NaN if none."""
         if self.angles is None:
             return float("nan")
         known = self.angles.stddev[np.isfinite(self.angles.stddev)]
@@ -77,12 +77,12 @@ def _targets(bag: BagReader) -> tuple[str, ...]:
 
 
 def _plain(name: str) -> str:
-    """A name without capitals, underscores and what it says of being a target."""
+    """A name in lower case without underscores and without words for 'target'."""
     return re.sub(r"(_|target|markers?)", "", name.lower())
 
 
 def segment_of(name: str) -> str | None:
-    """The segment of that name, in whatever style (``UpperArmRight``, ``upper_arm_right``); None for none."""
+    """The segment of that name in any style (``UpperArmRight``, ``upper_arm_right``); None if there is none."""
     return next((segment for segment in SEGMENTS if _plain(segment) == _plain(name)), None)
 
 
@@ -91,10 +91,10 @@ def mounted_on(targets: Iterable[str], mounted: Iterable[str]) -> dict[str, str]
 
     Args:
         targets: their names.
-        mounted: ``TARGET=SEGMENT`` each; a target without one is on the segment of its own name, if there is one.
+        mounted: ``TARGET=SEGMENT`` each; other targets are on the segment of their own name, if there is one.
 
     Raises:
-        EvaluationError: not of that form, an unknown target or segment, two targets on one segment, or fewer than two
+        EvaluationError: another format, an unknown target or segment, two targets on one segment, or fewer than two
             targets on segments.
     """
     there = tuple(targets)
@@ -128,15 +128,15 @@ def mounted_on(targets: Iterable[str], mounted: Iterable[str]) -> dict[str, str]
 
 
 def read_marker_reference(path: Path, mounted: Iterable[str] = ()) -> MarkerReference:
-    """The targets in a recording of the marker system.
+    """Read the targets in a recording of the marker system.
 
     Args:
         path: a bag folder or an mcap file.
-        mounted: as of :func:`mounted_on`.
+        mounted: as in :func:`mounted_on`.
 
     Raises:
         BagError: no such bag, or it is unreadable.
-        EvaluationError: no poses of targets, none that can be read, or as :func:`mounted_on`.
+        EvaluationError: no poses of targets, unreadable ones, or as :func:`mounted_on`.
     """
     with RigReader(path) as bag:
         names = _targets(bag)
@@ -189,14 +189,14 @@ def _track(poses: Mapping[int, tuple[FloatArray, FloatArray]], first_ns: int) ->
     )
 
 
-# --- mountings in a file
+# --- files of mountings
 
 
 def save_mountings(path: Path, mountings: Mapping[str, Mounting], segments: Mapping[str, str]) -> None:
-    """Write mountings as YAML, for recordings of the same targets on the same person.
+    """Write mountings as YAML, for other recordings with these targets mounted unchanged on the person.
 
     Raises:
-        FileError: it cannot be written.
+        FileError: the file cannot be written.
     """
     lines = ["# orientation of targets on segments: quaternion x, y, z, w (target to segment), covariance in rad2\n"]
     for target, mounting in mountings.items():
@@ -211,10 +211,10 @@ def load_mountings(path: Path, segments: Mapping[str, str]) -> dict[str, Mountin
 
     Args:
         path: the file.
-        segments: of the targets in use; others in the file are left out.
+        segments: by target in use; other targets in the file are ignored.
 
     Raises:
-        EvaluationError: it is unreadable, of another format, or has a target on another segment.
+        EvaluationError: the file is unreadable, of another format, or has a target on another segment.
     """
     try:
         content = files.read_yaml(path)

@@ -1,11 +1,11 @@
-"""Errors of an estimated movement against the truth: pure functions on arrays.
+"""Errors of an estimated motion against the truth: pure functions on arrays.
 
 There are two comparisons. *As it is*: each estimate against the truth at its own stamp and in its own frame, including
-delay, calibration and offset, as for a robot. *Aligned*: after one constant shift in time and one rigid transform over
-the whole recording, the estimates interpolated linearly to 100 Hz, as chapter 5.7 of Schlagenhauf 2017 compares with a
-marker system (tables 5.3 and E.1).
+delay, calibration error and offset, as a robot would use it. *Aligned*: after one constant time shift and one rigid
+transform over the whole recording, with the estimates interpolated linearly to 100 Hz, as in chapter 5.7 of
+Schlagenhauf 2017 for a marker system (tables 5.3 and E.1).
 
-Errors are also given without each joint's own offset, which is constant in the frame of its segment (``segments``).
+Errors are also given without each joint's constant offset in the frame of its segment (``segments``).
 
 Unknown values are NaN in every array; statistics are over values known in both, and NaN without any.
 """
@@ -26,9 +26,9 @@ from body_tracking.core.skeleton import BONES, BoolArray, FloatArray, IntArray
 from body_tracking.evaluation.segments import segment_frames
 
 RATE = 100.0
-"""Hz, the marker system's rate, to which the thesis interpolates (section 5.7.1)."""
+"""Hz: rate of the marker system, to which the thesis interpolates (section 5.7.1)."""
 MIN_SPEED = 0.02
-"""m/s, RMS over joints, below which the delay is not observable."""
+"""m/s: RMS speed over joints, below which the delay is not observable."""
 
 _LEVEL = 0.95
 _NORMAL = float(np.sqrt(chdtri(1, 1.0 - _LEVEL)))
@@ -42,15 +42,15 @@ class MetricsError(BodyTrackingError):
 
 
 class Curve:
-    """Values at any time: cubic splines through samples, a separate one on each side of a gap."""
+    """Interpolation by cubic splines through samples, with separate splines on both sides of a gap."""
 
     def __init__(self, times: FloatArray, values: FloatArray, max_gap: float = np.inf) -> None:
-        """Fit.
+        """Fit the splines.
 
         Args:
             times: (n,) s, increasing.
             values: (n, ...), NaN where unknown.
-            max_gap: s; known samples farther apart have nothing in between.
+            max_gap: s; no interpolation between known samples farther apart.
 
         Raises:
             MetricsError: times that do not increase.
@@ -88,9 +88,9 @@ class Curve:
 
 
 def sample(at: FloatArray, times: FloatArray, values: FloatArray) -> FloatArray:
-    """(n, ...) values at (n,) other times, linearly between (m, ...) values at (m,) increasing times.
+    """(n, ...) values at (n,) times, linearly interpolated between (m, ...) values at (m,) increasing times.
 
-    NaN where ``at`` is NaN or outside of the times.
+    NaN where ``at`` is NaN or outside the times.
     """
     at = np.where((at >= times[0]) & (at <= times[-1]), at, np.nan)
     after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
@@ -101,12 +101,12 @@ def sample(at: FloatArray, times: FloatArray, values: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """Joints over time.
+    """Positions of joints over time.
 
     Attributes:
         times: (n,) s, increasing.
         positions: (n, 25, 3) metres, NaN where unknown.
-        covariances: (n, 25, 3, 3) square metres, NaN or infinite where none is stated; None without any.
+        covariances: (n, 25, 3, 3) square metres, NaN or infinite where not stated; None if none are stated.
     """
 
     times: FloatArray
@@ -114,7 +114,7 @@ class Trajectory:
     covariances: FloatArray | None = None
 
     def at(self, times: FloatArray, max_gap: float) -> Trajectory:
-        """Linearly interpolated to (m,) s; unknown between samples more than ``max_gap`` s apart."""
+        """Linear interpolation at (m,) s; unknown between samples more than ``max_gap`` s apart."""
         after = np.clip(np.searchsorted(self.times, times), 1, len(self.times) - 1)
         unsure = (self.times[after] - self.times[after - 1] > max_gap) & ~np.isin(times, self.times)
         at = np.where(unsure, np.nan, times)
@@ -128,10 +128,10 @@ class Trajectory:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """Takes an estimate to the truth: ``truth(t - delay) = rotation estimate(t) + translation`` (thesis, eq. 4.1).
+    """Transform from estimate to truth: ``truth(t - delay) = rotation estimate(t) + translation`` (thesis, eq. 4.1).
 
     Attributes:
-        delay: s by which the estimate follows the truth.
+        delay: s by which the estimate lags the truth.
         rotation: (3, 3).
         translation: (3,) metres.
     """
@@ -141,28 +141,28 @@ class Alignment:
     translation: FloatArray
 
     def apply(self, estimate: Trajectory) -> Trajectory:
-        """The estimate in the truth's time and frame."""
+        """The estimate on the truth's clock and in its frame."""
         r = self.rotation
         covariances = None if estimate.covariances is None else r @ estimate.covariances @ r.T
         return Trajectory(estimate.times - self.delay, estimate.positions @ r.T + self.translation, covariances)
 
 
 def find_delay(estimate: Trajectory, truth: Curve, window: float = 0.5, around: float = 0.0) -> float:
-    """The constant time by which an estimate follows the truth, by least squares (thesis, sections 4.3.2 and 5.7.1).
+    """The constant delay of an estimate against the truth, by least squares (thesis, sections 4.3.2 and 5.7.1).
 
     Minimises the mean square of ``R e_j(t) + b_j - truth_j(t - delay)`` over times and joints. The rotation R and the
     joints' offsets b_j are free, with a closed form for each delay (Umeyama 1991, each joint about its own mean), so
-    that neither frames nor joint centres need agree. A grid search brackets the minimum for Brent's method.
+    that neither frames nor joint centres have to agree. A grid search brackets the minimum for Brent's method.
 
     Args:
         estimate: at any times.
         truth: (..., 25, 3) metres.
-        window: half the width of the search, s.
-        around: its centre, s.
+        window: half width of the search, s.
+        around: centre of the search, s.
 
     Returns:
-        Seconds; NaN where the delay is not observable: less than 20 mm/s of RMS speed, less than two windows in
-        common, or the minimum at the edge of the search.
+        Seconds; NaN if the delay is not observable: RMS speed below 20 mm/s, overlap shorter than two windows, or the
+        minimum at the edge of the search.
     """
     first, last = truth.span
     shown = estimate.times - around
@@ -199,15 +199,15 @@ def find_delay(estimate: Trajectory, truth: Curve, window: float = 0.5, around: 
 
 
 def align(estimate: Trajectory, truth: Curve, delay: float) -> Alignment:
-    """The least-squares rigid transform over all joints of the whole recording (thesis, section 5.7.1, eq. 5.1-5.7).
+    """Least-squares rigid transform over all joints of the whole recording (thesis, section 5.7.1, eq. 5.1-5.7).
 
     Args:
         estimate: at its own times.
         truth: (..., 25, 3) metres.
-        delay: s, as :func:`find_delay` gives it.
+        delay: s, from :func:`find_delay`.
 
     Raises:
-        MetricsError: fewer than three points in common, or all on one line.
+        MetricsError: fewer than three common points, or collinear points.
     """
     true = truth.at(estimate.times - delay)
     both = known(estimate.positions) & known(true)
@@ -219,7 +219,7 @@ def align(estimate: Trajectory, truth: Curve, delay: float) -> Alignment:
 
 
 def grid(first: float, last: float, rate: float = RATE) -> FloatArray:
-    """(n,) s from the first to the last at a rate in Hz."""
+    """(n,) s from first to last at a rate in Hz."""
     return first + np.arange(int(np.floor((last - first) * rate + 1e-6)) + 1) / rate
 
 
@@ -231,16 +231,16 @@ class JointErrors:
     """Errors of k joints over time; metres. MAE and MAD as in the thesis's tables 5.2-5.3 and E.1.
 
     Attributes:
-        frames: (k,) instants at which both are known.
+        frames: (k,) number of instants at which both are known.
         mae: (k, 3) mean absolute error along each axis.
-        largest: (k, 3) the largest (MAD).
+        largest: (k, 3) largest absolute error (MAD).
         mean: (k,) mean distance.
         rms: (k,) root mean square distance.
         farthest: (k,) largest distance.
         offset: (k, 3) mean error in the frame of the joint's segment.
-        fixed_mean: (k,) mean distance without that offset.
-        fixed_rms: (k,) root mean square distance without it.
-        covered: (k,) share of the frames with a stated covariance in which the truth lies in its 95 % ellipsoid.
+        fixed_mean: (k,) mean distance without the offset.
+        fixed_rms: (k,) root mean square distance without the offset.
+        covered: (k,) share of the frames with a stated covariance whose 95 % ellipsoid contains the truth.
     """
 
     frames: IntArray
@@ -261,7 +261,7 @@ def joint_errors(found: FloatArray, true: FloatArray, covariances: FloatArray | 
     Args:
         found: (n, 25, 3) metres.
         true: (n, 25, 3) metres.
-        covariances: (n, 25, 3, 3) square metres, of ``found``; None where none are stated.
+        covariances: (n, 25, 3, 3) square metres, of ``found``; None if not stated.
     """
     error = np.where((known(found) & known(true))[..., None], found - true, np.nan)
     distance = np.linalg.norm(error, axis=-1)
@@ -283,7 +283,7 @@ def joint_errors(found: FloatArray, true: FloatArray, covariances: FloatArray | 
 
 
 def position_coverage(error: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Share of the frames in which an error lies in the 95 % ellipsoid of its covariance (chi-square, 3 degrees).
+    """Share of frames with the error inside the 95 % ellipsoid of its covariance (chi-square, 3 degrees of freedom).
 
     Args:
         error: (n, k, 3) metres.
@@ -302,7 +302,7 @@ def position_coverage(error: FloatArray, covariances: FloatArray) -> FloatArray:
 
 
 def off_track(found: FloatArray, true: FloatArray, beyond: float) -> FloatArray:
-    """Share of the frames with a true joint in which the estimate is missing or farther off than ``beyond``.
+    """Share of frames with a true joint in which the estimate is missing or farther away than ``beyond``.
 
     Args:
         found: (n, k, 3) metres.
@@ -317,14 +317,14 @@ def off_track(found: FloatArray, true: FloatArray, beyond: float) -> FloatArray:
 
 
 def jitter(times: FloatArray, found: FloatArray, true: FloatArray) -> FloatArray:
-    """Jitter of each joint beyond the true movement, as the standard deviation of equivalent white noise.
+    """Jitter of each joint beyond the true motion, as the standard deviation of equivalent white noise.
 
-    The excess of the estimate's mean squared third difference over the truth's at the same instants, divided by 20: the
+    Excess of the estimate's mean squared third difference over the truth's at the same instants, divided by 20: the
     third difference of white noise with variance s^2 has the variance (1 + 9 + 9 + 1) s^2. Offsets, delay and slow
     errors have no influence.
 
     Args:
-        times: (n,) s; uses four frames in a row whose steps are within a quarter of the median step.
+        times: (n,) s; only four consecutive frames with steps within a quarter of the median step are used.
         found: (n, k, 3) metres.
         true: (n, k, 3) metres at the same times.
 
@@ -350,8 +350,8 @@ class LengthErrors:
 
     Attributes:
         spread: (24,) standard deviation of the estimated length over time.
-        true_spread: (24,) that of the true one.
-        error: (24,) mean estimated length minus mean true length, over the same frames.
+        true_spread: (24,) standard deviation of the true length.
+        error: (24,) mean estimated minus mean true length, over common frames.
     """
 
     spread: FloatArray
@@ -383,13 +383,13 @@ class AngleErrors:
     """Errors of m angles over time; radians.
 
     Attributes:
-        frames: (m,) instants at which both are known.
-        rmse: (m,) root mean square.
-        offset: (m,) mean.
-        fixed_rmse: (m,) root mean square without the mean.
-        mae: (m,) mean absolute.
-        largest: (m,) largest absolute.
-        covered: (m,) share of the frames with a stated standard deviation in which the truth lies within 1.96 of them.
+        frames: (m,) number of instants at which both are known.
+        rmse: (m,) root mean square error.
+        offset: (m,) mean error.
+        fixed_rmse: (m,) root mean square error without the offset.
+        mae: (m,) mean absolute error.
+        largest: (m,) largest absolute error.
+        covered: (m,) share of the frames with a stated standard deviation in which the error is within 1.96 of it.
     """
 
     frames: IntArray
@@ -402,12 +402,12 @@ class AngleErrors:
 
 
 def angle_errors(found: FloatArray, true: FloatArray, stddev: FloatArray | None = None) -> AngleErrors:
-    """Compare angles at the same instants; 359 deg and 1 deg are 2 deg apart. RMSE: thesis, eq. 4.2.
+    """Compare angles at the same instants; differences wrap at 360 degrees. RMSE: thesis, eq. 4.2.
 
     Args:
         found: (n, m) radians.
         true: (n, m) radians.
-        stddev: (n, m) radians; ignored where not finite or not positive. None where none are stated.
+        stddev: (n, m) radians; ignored where not finite or not positive. None if not stated.
     """
     error = wrapped(found - true)
     offset = _mean(error)
@@ -439,7 +439,7 @@ class PoseErrors:
     Attributes:
         rotation: (n,) radians.
         translation: (n,) metres, of the sensor.
-        displacement: (n,) metres, of a point at the person's place.
+        displacement: (n,) metres, of a point at the person's position.
     """
 
     rotation: FloatArray
@@ -461,7 +461,7 @@ def pose_errors(
         translations: (n, 3) metres.
         true_rotation: (3, 3).
         true_translation: (3,) metres.
-        place: (3,) metres, where the person is in world.
+        place: (3,) metres, the person's position in world.
     """
     turned = rotations @ true_rotation.T
     seen = true_rotation.T @ (place - true_translation)
@@ -473,12 +473,12 @@ def pose_errors(
 
 
 def known(positions: FloatArray) -> BoolArray:
-    """(...) which of (..., 3) points are finite."""
+    """(...) mask of finite points (..., 3)."""
     return np.asarray(np.isfinite(positions).all(axis=-1))
 
 
 def _mean(values: FloatArray) -> FloatArray:
-    """Mean over the first axis, without NaN."""
+    """Mean over the first axis, ignoring NaN and infinity."""
     there = np.isfinite(values)
     with np.errstate(invalid="ignore"):
         mean: FloatArray = np.where(there, values, 0.0).sum(axis=0) / there.sum(axis=0)
@@ -486,6 +486,6 @@ def _mean(values: FloatArray) -> FloatArray:
 
 
 def _max(values: FloatArray) -> FloatArray:
-    """Maximum over the first axis, without NaN."""
+    """Maximum over the first axis, ignoring NaN."""
     largest: FloatArray = np.fmax.reduce(values, axis=0, initial=np.nan)
     return largest

@@ -1,9 +1,9 @@
-"""Compares two estimates of one person by their joint angles, each counted with the deviation that it states.
+"""Compares two estimates of one person by their joint angles, weighted by their stated standard deviations.
 
-Joint angles depend on neither frame, so that only the clocks are aligned, by how fast the segments turn
-(:mod:`body_tracking.evaluation.start_clock`). The difference of two angles with deviations a and b has the deviation
-sqrt(a^2 + b^2); with one estimate as the reference of the other, :mod:`body_tracking.evaluation.reference_error` says
-how large the other one's own error is.
+Joint angles are independent of the frame, so only the clocks are aligned, by the segments' angular speeds
+(:mod:`body_tracking.evaluation.start_clock`). The difference of two angles with standard deviations a and b has the
+standard deviation sqrt(a^2 + b^2); with one estimate as the reference,
+:mod:`body_tracking.evaluation.reference_error` computes the other one's own error.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from body_tracking.evaluation.start_clock import STAMPS_AS_THEY_ARE, start_clock
 from body_tracking.kinematics.labels import UNKNOWN
 
 USABLE: Final = float(np.radians(UNKNOWN))
-"""Radians of deviation from which on an angle counts as unknown."""
+"""Radians: standard deviation above which an angle counts as unknown."""
 LEAST_OVERLAP: Final = 2.0
-"""Seconds that both recordings must cover."""
+"""Least overlap of both recordings, seconds."""
 _NORMAL: Final = 1.96
 
 
@@ -35,15 +35,15 @@ class MutualComparison:
     """Two estimates of one person.
 
     Attributes:
-        estimate: the one that is judged.
-        reference: the one by which it is judged.
+        estimate: the evaluated estimate.
+        reference: the other estimate.
         offset_s: the reference's clock minus the estimate's.
-        clock_stddev: s, of that; NaN where the movement does not determine it and the stamps are taken as they are.
-        seconds: that both cover.
-        angles: of the convention of both, where both know one.
-        measured: radians, RMS difference of all these together.
-        covered: share of all differences within 1.96 of the deviation that both state.
-        notes: a line each.
+        clock_stddev: s, of ``offset_s``; NaN if the motion does not determine it and the stamps are used unchanged.
+        seconds: covered by both.
+        angles: of the common convention, where both know the angle.
+        measured: RMS difference over all these angles, radians.
+        covered: share of the differences within 1.96 standard deviations, combined from both.
+        notes: one per line.
     """
 
     estimate: EstimatedSegments
@@ -58,7 +58,7 @@ class MutualComparison:
 
 
 def compare_estimates(estimate: EstimatedSegments, reference: EstimatedSegments) -> MutualComparison:
-    """Judge an estimate by another one of the same person.
+    """Evaluate an estimate against another one of the same person.
 
     Raises:
         EvaluationError: angles of different conventions, or too little overlap.
@@ -83,7 +83,7 @@ def compare_estimates(estimate: EstimatedSegments, reference: EstimatedSegments)
     mine, theirs = ([series.names.index(name) for name in shared] for series in (estimate.angles, reference.angles))
     errors = wrapped(own.position[:, mine] - other.position[:, theirs])
     variance = other.stddev[:, theirs] ** 2
-    # an error of the clock is one of the angle in proportion to its rate
+    # a clock error causes an angle error in proportion to the angle's rate
     step = float(np.median(np.diff(times)))
     rates = np.gradient(np.unwrap(other.position[:, theirs], axis=0), step, axis=0)
     variance = variance + (np.nan_to_num(stddev) * rates) ** 2
@@ -133,7 +133,7 @@ def _differences(
 
 
 def _clock(estimate: EstimatedSegments, reference: EstimatedSegments, both: str) -> tuple[float, float, list[str]]:
-    """The reference's clock minus the estimate's and its deviation, seconds, and notes."""
+    """The reference's clock minus the estimate's, its standard deviation, both in seconds, and notes."""
     apart = float(int(estimate.stamps_ns[0]) - int(reference.stamps_ns[0])) / NANOSECONDS
     own, other = (
         {name: each.track(each.rotations[:, number]) for number, name in enumerate(SEGMENTS)}

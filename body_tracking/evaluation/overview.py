@@ -1,4 +1,4 @@
-"""An evaluation in a few lines: the middle, the best and the worst error, and how true the stated deviations are."""
+"""Summary of an evaluation: median, best and worst error, and coverage of the stated standard deviations."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from body_tracking.core.skeleton import FloatArray, IntArray
 
 
 def errors_in_words(names: Sequence[str], errors: FloatArray, unit: str) -> str:
-    """The middle of the errors, and which are the smallest and the largest.
+    """The median of the errors, and the names of the smallest and largest.
 
     Args:
         names: n names.
-        errors: (n,) in the unit; NaN where there is none.
+        errors: (n,) in the unit; NaN if there is none.
         unit: mm or deg.
     """
     there = np.isfinite(errors)
@@ -28,12 +28,12 @@ def errors_in_words(names: Sequence[str], errors: FloatArray, unit: str) -> str:
 
 
 def coverage_in_words(event: str, covered: FloatArray, frames: FloatArray | IntArray) -> str:
-    """In which share of all frames the truth is where the estimate says.
+    """Share of frames in which the truth lies within the stated bounds, in words.
 
     Args:
-        event: whose probability is 95 %.
-        covered: (n,) shares; NaN where no deviation is stated.
-        frames: (n,) how many frames each is a share of.
+        event: description of the event whose probability should be 95 %.
+        covered: (n,) shares; NaN if no standard deviation is stated.
+        frames: (n,) number of frames behind each share.
     """
     there = np.isfinite(covered)
     if not there.any():

@@ -1,9 +1,9 @@
-"""The frequency of a pendulum by what a sensor sees of it (Schlagenhauf 2017, section 4.1.2; figures 4.9-4.10).
+"""Frequency of a pendulum from a sensor's signal (Schlagenhauf 2017, section 4.1.2; figures 4.9-4.10).
 
-She compares measured with theoretical frequencies and does not say how she measures them. Here a damped oscillation is
-fitted to the signal at its true stamps, so that lost and irregular frames do no harm. The period of a pendulum grows
-with its amplitude, by 0.4 % at 15 degrees, so the fitted frequency is that of small amplitudes, which the length
-gives: sqrt(g / L) / (2 pi).
+The thesis compares measured with theoretical frequencies without describing the measurement. Here a damped oscillation
+is fitted to the signal at its true stamps, so that lost frames and irregular intervals do no harm. The period of a
+pendulum grows with its amplitude, by 0.4 % at 15 degrees; the fitted frequency is that of small amplitudes, which
+depends on the length alone: sqrt(g / L) / (2 pi).
 """
 
 from __future__ import annotations
@@ -22,26 +22,27 @@ from body_tracking.core.imu import STANDARD_GRAVITY
 from body_tracking.core.skeleton import FloatArray
 
 Signal = Literal["sine", "angle", "rate"]
-"""Of the pendulum's angle to the vertical: its sine, which is the ball's displacement as a share of the length; the
-angle, radians; and its rate, radians per second."""
+"""Kind of signal of the pendulum's angle to the vertical: its sine (the ball's displacement as a share of the length),
+the angle (radians), or its rate (radians per second)."""
 SLOWEST, FASTEST = 0.1, 5.0
-"""Hz between which the frequency is searched: pendulums of 25 m and of 10 mm."""
+"""Limits of the searched frequency, Hz: pendulums of 25 m and 10 mm."""
 _PERIODS: Final = 3.0
 """Least number of periods in a signal."""
 _LEAST: Final = 20
 """Least number of samples."""
 _ROUNDS: Final = 5
-"""Fits of the arc, each without the outliers of the one before."""
+"""Number of fits of the arc, each without the outliers of the previous one."""
 _FAR: Final = 3.0
-"""Median distances from the middle within which points tell the direction of a swing, whose ends are 1.4 away."""
+"""Largest distance, in median distances from the middle, of points used for the swing's direction; its ends are at
+1.4."""
 _OUTLIER: Final = 4.0
-"""Standard deviations from which on a point is no point of the arc."""
+"""Standard deviations above which a point is an outlier of the arc."""
 _NORMAL_MAD: Final = 1.4826
-"""Standard deviation of a normal distribution in median absolute deviations."""
+"""Standard deviation of a normal distribution in units of its median absolute deviation."""
 
 
 class PendulumError(BodyTrackingError):
-    """A signal is not that of a swinging pendulum, or its file cannot be used."""
+    """Raised for a signal that is not a swinging pendulum's, or an unusable file."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,9 +51,9 @@ class Swing:
 
     Attributes:
         frequency: Hz, for small amplitudes and without damping.
-        stddev: of the frequency by the scatter of the signal, Hz.
+        stddev: standard deviation of the frequency from the scatter of the signal, Hz.
         amplitude: radians, at the first sample.
-        damping: 1/s, of the amplitude.
+        damping: decay rate of the amplitude, 1/s.
         residual: root mean square of the signal's residual, in its unit.
         fitted: (n,) the oscillation at the times of the samples, in the signal's unit.
     """
@@ -66,21 +67,21 @@ class Swing:
 
 
 def natural_frequency(length: float, gravity: float = STANDARD_GRAVITY) -> float:
-    """Hz of a point on a string of a length in metres, for small amplitudes."""
+    """Natural frequency (Hz) for small amplitudes of a point on a string of this length (m)."""
     return float(np.sqrt(gravity / length) / (2.0 * np.pi))
 
 
 def oscillation(times: FloatArray, parameters: FloatArray, signal: Signal) -> tuple[FloatArray, float]:
-    """The signal at (n,) s after the start, and the amplitude there, radians.
+    """The signal at (n,) s after the start, and the initial amplitude, radians.
 
-    The phase advances by the angular frequency at the amplitude theta of the time: omega (1 - theta^2 / 16 +
-    theta^4 / 3072), the inverse of the series of the period, 1 + theta^2 / 16 + 11 theta^4 / 3072. The test compares
-    it with integrated equations of motion.
+    The phase advances by the angular frequency at the present amplitude theta: omega (1 - theta^2 / 16 +
+    theta^4 / 3072), the inverse of the period's series, 1 + theta^2 / 16 + 11 theta^4 / 3072. A test compares it with
+    integrated equations of motion.
 
     Args:
         times: (n,) s.
         parameters: (5,) angular frequency rad/s, damping 1/s, amplitudes of cosine and minus sine at the start, offset.
-        signal: which one.
+        signal: kind of signal.
     """
     omega, damping, cosine, sine, offset = parameters
     amplitude = np.hypot(cosine, sine)
@@ -108,11 +109,11 @@ def fit_swing(times: FloatArray, values: FloatArray, signal: Signal) -> Swing:
 
     Args:
         times: (n,) s, the capture times; any steps.
-        values: (n,) the signal.
-        signal: which one it is, which tells the amplitude as an angle.
+        values: (n,) the signal; NaN where unknown.
+        signal: kind of signal, which determines the amplitude as an angle.
 
     Raises:
-        PendulumError: too few samples or periods, or nothing that swings.
+        PendulumError: too few samples or periods, or no oscillation.
     """
     known = np.isfinite(values)
     if np.count_nonzero(known) < _LEAST:
@@ -140,7 +141,7 @@ def fit_swing(times: FloatArray, values: FloatArray, signal: Signal) -> Swing:
     low = np.array([2.0 * np.pi * 0.5 * SLOWEST, -5.0 / span, *(-np.inf,) * 3])
     bounds = low, np.array([4.0 * np.pi * FASTEST, 50.0 / span, *(np.inf,) * 3])
     for _ in range(2):
-        # the second time with a scale of outliers that the decay does not widen
+        # the second fit uses an outlier scale from the residuals of the damped model
         found = least_squares(
             *(residuals, begin), bounds=bounds, x_scale=scale, loss="soft_l1", f_scale=spread(residuals(begin))
         )
@@ -167,7 +168,7 @@ def fit_swing(times: FloatArray, values: FloatArray, signal: Signal) -> Swing:
 
 
 def along(points: FloatArray) -> FloatArray:
-    """(n, d) components of (n, d) points about their median along their principal axes, the longest first.
+    """(n, d) coordinates of (n, d) points relative to their median along their principal axes, the largest first.
 
     NaN where unknown.
     """
@@ -182,22 +183,22 @@ def along(points: FloatArray) -> FloatArray:
 
 
 def sines(points: FloatArray) -> FloatArray:
-    """(n,) sines of the pendulum's angle by the arc that its ball makes in the image, up to a constant.
+    """(n,) sines of the pendulum's angle from the arc of its ball in the image, up to a constant.
 
-    The ball is at R (sin, 1 - cos) of the angle. How it rises towards the ends of the arc gives R in the image, so that
-    neither the camera's distance nor the length is needed. The swing is taken to be across the view.
+    The ball is at R (sin, 1 - cos) of the angle. The curvature of the arc gives R in the image, so that neither the
+    camera's distance nor the length is needed. The swing is assumed to be perpendicular to the view.
 
     Args:
-        points: (n, 2) ideal image coordinates x/z and y/z, without distortion; NaN where unknown.
+        points: (n, 2) undistorted image coordinates x/z and y/z; NaN where unknown.
     """
     u, v = along(points).T
     known = np.isfinite(u)
-    # one far from the others would bend the first arc
+    # a distant outlier would bend the first arc
     near = known & (np.abs(u) <= _FAR * np.median(np.abs(u[known])))
     off = np.abs(v - np.median(v[known]))
     inside, curvature = near & (off <= _OUTLIER * _NORMAL_MAD * np.median(off[known])), 0.0
     for _ in range(_ROUNDS):
-        # the arc over c: (1 - sqrt(1 - c^2 u^2)) / c = c u^2 / (1 + sqrt(1 - c^2 u^2))
+        # arc of curvature c: (1 - sqrt(1 - c^2 u^2)) / c = c u^2 / (1 + sqrt(1 - c^2 u^2))
         rise = u**2 / (1.0 + np.sqrt(np.maximum(1.0 - (curvature * u) ** 2, 0.0)))
         design = np.column_stack([np.ones_like(u), u, rise])
         line = np.linalg.lstsq(design[inside], v[inside], rcond=None)[0]
@@ -207,24 +208,24 @@ def sines(points: FloatArray) -> FloatArray:
     return np.asarray(curvature * u)
 
 
-# --- the pendulum with Vicon of Szczesna et al. (2016)
+# --- the data set of a pendulum with Vicon of Szczesna et al. (2016)
 
 _HEADER: Final = "Time;Vicon Orientation;"
 _WIDTH: Final = 14
 _LARGEST, _SMALLEST = np.radians([20.0, 2.0])
-"""Amplitudes between which a decay counts: three links swing together once the higher modes have died away."""
+"""Amplitudes between which a decay is used: three links swing together once the higher modes have died away."""
 _SWINGS: Final = 7
-"""Half periods of a decay, at least."""
+"""Least number of half periods of a decay."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decay:
-    """A pendulum that was let go: what Vicon and an inertial sensor on it measured.
+    """A released pendulum, measured by Vicon and by an inertial sensor on it.
 
     Attributes:
-        start: s, of the file's time.
-        vicon: fitted to the angle of its orientation.
-        gyroscope: fitted to the rate about the same axis.
+        start: s, on the file's clock.
+        vicon: fit of the angle of Vicon's orientation.
+        gyroscope: fit of the angular rate about the same axis.
     """
 
     start: float
@@ -233,7 +234,7 @@ class Decay:
 
 
 def is_vicon_pendulum(path: Path) -> bool:
-    """Whether a ``.csv`` or ``.csv.gz`` file is of the data set's layout.
+    """Whether a ``.csv`` or ``.csv.gz`` file has the data set's layout.
 
     Raises:
         CsvError: the file cannot be read.
@@ -242,13 +243,13 @@ def is_vicon_pendulum(path: Path) -> bool:
 
 
 def vicon_decays(path: Path) -> list[Decay]:
-    """The decays of a link of the pendulum (RepoIMU; Szczesna et al. 2016), a row after each release.
+    """The decays of a link of the pendulum (RepoIMU; Szczesna et al. 2016), one per release.
 
-    The angle is that about the axis of most movement. Rows that repeat a reading of the gyroscope are left out.
+    The angle is about the axis of most motion. Rows that repeat a reading of the gyroscope are ignored.
 
     Raises:
         CsvError: the file cannot be read.
-        PendulumError: another layout, or no decay in it.
+        PendulumError: another layout, or no decay.
     """
     if not is_vicon_pendulum(path):
         raise PendulumError(f"{path}: the header is not that of Szczesna et al. (2016), {_HEADER!r}...")
@@ -260,7 +261,7 @@ def vicon_decays(path: Path) -> list[Decay]:
         raise PendulumError(f"{path}: not {_WIDTH} columns in all rows")
     times, quats, rates = rows[:, 0], rows[:, 1:5], rows[:, 8:11]
     sound = np.abs(np.linalg.norm(quats, axis=1) - 1.0) < 0.01
-    # small angles about one axis: twice the vector part, of the half in which w is positive
+    # small angles about one axis: about twice the vector part of the quaternion with positive w
     vectors = 2.0 * np.arcsin(np.clip(quats[:, 1:] * np.sign(quats[:, :1]), -1.0, 1.0))
     angle = along(np.where(sound[:, None], vectors, np.nan))[:, 0]
     moved = np.concatenate([[True], (np.diff(rates, axis=0) != 0.0).any(axis=1)])
@@ -281,18 +282,18 @@ def vicon_decays(path: Path) -> list[Decay]:
 
 
 def _number(cell: str) -> float:
-    """A cell; the files have some commas for points."""
+    """The number in a cell; some files have decimal commas."""
     return float(cell.replace(",", ".") or "nan")
 
 
 def _decays(times: FloatArray, angle: FloatArray) -> list[tuple[int, int]]:
-    """First and last row of each run of extrema of either sign that only become smaller."""
+    """First and last row of each run of alternating extrema with decreasing size."""
     filled = np.interp(times, times[np.isfinite(angle)], angle[np.isfinite(angle)])
     step = float(np.median(np.diff(times)))
     apart = max(1, round(0.25 / step))
     peaks = np.sort(
         np.concatenate(
-            # prominence: a higher mode makes no extremum of its own
+            # prominence: extrema of higher modes are ignored
             [
                 find_peaks(sign * filled, height=_SMALLEST, distance=apart, prominence=2.0 * _SMALLEST)[0]
                 for sign in (1, -1)

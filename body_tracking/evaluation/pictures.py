@@ -1,4 +1,4 @@
-"""Pictures: the person at some instants, angles over time with their uncertainty, and errors over time."""
+"""Plots: the person at some instants, angles over time with their uncertainty, and errors over time."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from body_tracking.evaluation.report import named_are_positional, write
 _COLOURS = {"left": "#1f6fb4", "right": "#d1571b", "": "#3a3a3a"}
 _COLUMNS, _INSTANTS = 4, 6
 _POINTS = 1500
-"""Points of a curve at most: no more than the picture has columns."""
+"""Largest number of points of a curve; the picture has no more columns."""
 _STILL = 30.0
-"""Degrees that an axis of angles shows at least: a still angle should look still."""
+"""Least range of an axis of angles, degrees: a constant angle should look constant."""
 _FINE = 0.5
-"""Degrees of deviation below which errors have panels of their own."""
+"""Degrees: median standard deviation below which errors have panels of their own."""
 _VIEW = np.radians(25.0)
-"""Angle of the view from the person's front, so that depth is visible."""
+"""Angle of the view from the person's front, which makes depth visible."""
 
 
 def _legend(names: Iterable[str], dashed: str = ", truth dashed") -> str:
@@ -36,7 +36,7 @@ def _legend(names: Iterable[str], dashed: str = ", truth dashed") -> str:
 
 
 def draw(tracked: Tracked, path: Path) -> None:
-    """Draw the person and the angles of a recording, at least one frame, into a PNG file; raises as :func:`write`."""
+    """Draw the person and the angles of a recording (at least one frame) into a PNG file; raises as :func:`write`."""
     angles, known = tracked.angles, tracked.angles.known
     start_ns = int(angles.stamps_ns[0])
     times, true = (angles.stamps_ns - start_ns) / NANOSECONDS, true_at(angles, tracked.true_angles)
@@ -59,13 +59,13 @@ def draw(tracked: Tracked, path: Path) -> None:
 
 
 def are_fine(angles: AngleSeries) -> bool:
-    """Whether deviations are so small that neither a curve nor a tenth of a degree shows them."""
+    """Whether standard deviations are too small to be visible in a plot of angles."""
     stated = angles.stddev[np.isfinite(angles.stddev)]
     return bool(len(stated)) and float(np.degrees(np.median(stated))) < _FINE
 
 
 def pictures(result: Evaluation) -> list[tuple[str, str]]:
-    """Captions and ``data:`` addresses of the pictures of an evaluation's report."""
+    """Captions and ``data:`` addresses of the plots in an evaluation's report."""
     first = result.comparisons[0]
     angles = first.named if first.named is not None and not named_are_positional(result) else first.positional
     drawn = [
@@ -78,12 +78,12 @@ def pictures(result: Evaluation) -> list[tuple[str, str]]:
 
 
 def reference_pictures(angles: AngleComparison) -> list[tuple[str, str]]:
-    """The same of an evaluation by the marker system, given its angles."""
+    """Captions and ``data:`` addresses of the plots in an evaluation by the marker system."""
     return [(f"Angles, degrees; {_legend(angles.names)}", _angle_picture(angles))] if angles.names else []
 
 
 def _angle_picture(angles: AngleComparison) -> str:
-    """``data:`` address of a picture of angles beside true ones, without those that the estimate does not state."""
+    """``data:`` address of a plot of angles beside true ones; angles that the estimate does not state are left out."""
     stated = np.isfinite(angles.stddev)
     figure = figure_of(_height(angles.names))
     _draw_angles(figure, replace(angles, found=np.where(stated | ~stated.any(), angles.found, np.nan)))
@@ -127,7 +127,7 @@ def _side(name: str) -> str:
 
 
 def _panels(names: tuple[str, ...]) -> dict[str, list[int]]:
-    """Columns by title: left and right of an angle share a panel."""
+    """Column indices by title: left and right angles share a panel."""
     panels: dict[str, list[int]] = {}
     for column, name in enumerate(names):
         panels.setdefault(name.removesuffix(f"_{_side(name)}").replace("_", " "), []).append(column)
@@ -139,7 +139,7 @@ def _height(names: tuple[str, ...]) -> float:
 
 
 def _unbroken(degrees: FloatArray) -> FloatArray:
-    """The curve with gaps where it wraps between +180 and -180."""
+    """The curve, interrupted where it wraps between +180 and -180 degrees."""
     curve = degrees.copy()
     curve[1:][np.abs(np.diff(degrees)) > 180.0] = np.nan
     return curve
@@ -157,11 +157,11 @@ def _draw_angles(figure: Any, angles: AngleComparison, still: float = _STILL) ->
             low, high = curve - band[:, column], curve + band[:, column]
             axis.fill_between(times, low, high, color=colour, alpha=0.18, linewidth=0.0)
             axis.plot(times, curve, color=colour, linewidth=1.3)
-            # between unknown ones an angle has no line, but a place on the axis
+            # isolated known angles have no line, so draw a dot
             around = np.pad(np.isfinite(curve), 1)
             axis.plot(*np.array([times, curve])[:, around[1:-1] & ~around[:-2] & ~around[2:]], ".", color=colour)
             axis.plot(times, _unbroken(true[:, column]), "--", color="black", linewidth=0.8)
-        edge = np.nan_to_num(np.minimum(band[:, columns], 30.0))  # wider ones would leave the curves flat
+        edge = np.nan_to_num(np.minimum(band[:, columns], 30.0))  # wider bands would flatten the curves
         edges = np.concatenate([found[:, columns] - edge, found[:, columns] + edge, true[:, columns]])
         least, most = (np.nanmin(edges), np.nanmax(edges)) if np.isfinite(edges).any() else (0.0, 0.0)
         margin = max(0.05 * (most - least), 0.5 * (still - (most - least)))
@@ -179,7 +179,7 @@ def _draw_angles(figure: Any, angles: AngleComparison, still: float = _STILL) ->
 def _draw_person(figure: Any, tracked: Tracked, start_ns: int) -> None:
     """Stick figures at evenly spaced instants.
 
-    The true ones are moved to the same pelvis and turned by one angle about z, because their world may be another one.
+    The true figures are moved to the estimate's pelvis and turned by one angle about z, since their world may differ.
     """
     skeletons, truths = tracked.skeletons, tracked.true_skeletons
     chosen = [skeletons[n] for n in np.unique(np.linspace(0, len(skeletons) - 1, _INSTANTS).astype(int))]
@@ -214,7 +214,7 @@ def _draw_bones(axis: Any, points: FloatArray, **style: Any) -> None:
 
 
 def _left(skeletons: Iterable[Skeleton]) -> npt.NDArray[np.complex128]:
-    """(n,) x + iy of the vectors from the right hip to the left one, metres; 0 where unknown."""
+    """(n,) x + iy of the vectors from the right hip to the left hip, metres; 0 if unknown."""
     across = np.array([each.positions[Joint.HIP_LEFT] - each.positions[Joint.HIP_RIGHT] for each in skeletons])
     across = np.nan_to_num(across.reshape(-1, 3))
     left: npt.NDArray[np.complex128] = across[:, 0] + 1j * across[:, 1]
@@ -222,18 +222,18 @@ def _left(skeletons: Iterable[Skeleton]) -> npt.NDArray[np.complex128]:
 
 
 def _heading(skeletons: list[Skeleton]) -> float:
-    """Radians from the world's x axis to the mean direction of the person's left."""
+    """Mean direction of the person's left, radians from the world's x axis."""
     return float(np.angle(_left(skeletons).sum()))
 
 
 def _turn(pairs: list[tuple[Skeleton, Skeleton]]) -> float:
-    """Radians about z by which the second skeletons are turned against the first; 0 without common hips."""
+    """Rotation about z of the second skeletons relative to the first, radians; 0 without common hips."""
     first, second = _left(first for first, _ in pairs), _left(second for _, second in pairs)
     return float(np.angle((second * first.conj()).sum()))
 
 
 def _view(heading: float) -> FloatArray:
-    """(2, 3) world to picture: turned from the person's front by the angle of the view, z up."""
+    """(2, 3) projection from world to picture: turned from the person's front by the angle of view, z up."""
     angle = heading + _VIEW  # the person's left is the picture's right
     return np.array([[np.cos(angle), np.sin(angle), 0.0], [0.0, 0.0, 1.0]])
 
@@ -247,7 +247,7 @@ def _errors(result: Evaluation) -> str:
     distances = 1e3 * np.linalg.norm(comparison.found - comparison.true, axis=-1)[shown][:, joints]
     times = comparison.times[shown]
     gap = max(MAX_GAP, 2.0 * float(np.median(np.diff(times))))
-    after = np.repeat(np.flatnonzero(np.diff(times) > gap) + 1, 2)  # a gap, which its neighbours would fill
+    after = np.repeat(np.flatnonzero(np.diff(times) > gap) + 1, 2)  # gaps, which neighbouring cells would cover
     edges = np.where(np.arange(len(after)) % 2, times[after] - gap / 3.0, times[after - 1] + gap / 3.0)
     distances, times = np.insert(distances, after, np.nan, axis=0), np.insert(times, after, edges)
     figure, rows = figure_of(5.0), range(len(joints))

@@ -1,38 +1,38 @@
-"""Marker trajectories as truth: joint centres from C3D files with Vicon's Plug-in Gait markers.
+"""Joint centres from C3D files with Vicon's Plug-in Gait markers, as ground truth.
 
 Source: Vicon, "Plug-in Gait Reference Guide" (marker placement, joint centres by the chord function);
 Davis, Ounpuu, Tyburski and Gage, Human Movement Science 10 (1991), for the hip. Gaps shorter than 0.2 s are filled by
-splines and the trajectories smoothed by splines under generalised cross-validation (Woltring 1986), as Schlagenhauf
-did (2017, section 5.6.3).
+splines, and the trajectories are smoothed by splines with generalised cross-validation (Woltring 1986), as in
+Schlagenhauf (2017, section 5.6.3).
 
-Joint centres. From the same markers and measurements, unsmoothed, shoulder, elbow, wrist, hand and hip are Vicon's own
-to below a micrometre. With ``r`` the marker's radius and :func:`chord` the chord function:
+Joint centres. With the same markers and measurements, unsmoothed, shoulder, elbow, wrist, hand and hip agree with
+Vicon's within a micrometre. With ``r`` the marker's radius and :func:`chord` the chord function:
 
-- thorax: z from the middle of T10 and STRN to that of C7 and CLAV; x from the middle of C7 and T10 to that of CLAV and
-  STRN, at a right angle to z; y to the left; origin ``r`` behind CLAV.
-- shoulder: chord from the thorax's origin and SHO, downwards at a right angle to x, by shoulder offset + r.
-- elbow: chord from the shoulder and ELB, medially along the normal of the plane of shoulder, ELB and the middle of WRA
-  and WRB, by half the elbow's width + r.
-- wrist: from the middle of WRA and WRB, at a right angle to the wrist bar and to the line to the elbow, towards the
+- thorax: z from the midpoint of T10 and STRN to that of C7 and CLAV; x from the midpoint of C7 and T10 to that of CLAV
+  and STRN, perpendicular to z; y to the left; origin ``r`` behind CLAV.
+- shoulder: chord from the thorax's origin and SHO, downwards perpendicular to x, by shoulder offset + r.
+- elbow: chord from the shoulder and ELB, medially along the normal of the plane of shoulder, ELB and the midpoint of
+  WRA and WRB, by half the elbow's width + r.
+- wrist: from the midpoint of WRA and WRB, perpendicular to the wrist bar and to the line to the elbow, towards the
   palm, by half the wrist's width + r.
-- hand: chord from the wrist and FIN, towards the palm in the plane of wrist, FIN and the middle of WRA and WRB, by half
-  the hand's thickness + r.
+- hand: chord from the wrist and FIN, towards the palm in the plane of wrist, FIN and the midpoint of WRA and WRB, by
+  half the hand's thickness + r.
 - hips: regression on leg length and pelvis (Davis 1991); without a leg length that of Harrington et al., J. Biomech. 40
   (2007), on the pelvis alone.
 
-Where they go among the Kinect's joints: Shoulder, Elbow, Wrist, Hand and Hip to the centres; SpineBase to the middle of
-the hips. Approximated, because Plug-in Gait knows no such points: SpineShoulder is the middle of C7 and CLAV, SpineMid
-that of T10 and STRN, Head that of the four head markers. Neck, thumbs, hand tips and legs stay unknown.
+Assignment to the Kinect's joints: Shoulder, Elbow, Wrist, Hand and Hip are these centres; SpineBase is the midpoint of
+the hips. Approximations, because Plug-in Gait has no such points: SpineShoulder is the midpoint of C7 and CLAV,
+SpineMid that of T10 and STRN, Head the mean of the four head markers. Neck, thumbs, hand tips and legs stay unknown.
 
-Other approximations. A measurement that is not known is estimated: the shoulder lies 12 % of the distance between the
-acromia from its marker and the elbow 40 mm from its own (both as in ``benchmarks/kinect_vs_vicon.py``); the wrist is
-40 mm wide and the hand 30 mm thick, as Vicon supposes before they are measured, and so is an offset of the shoulder of
-50 mm where one acromion is not seen. The splines are cubic, Vicon's quintic.
+Other approximations. Unknown measurements are estimated: the shoulder lies 12 % of the distance between the acromia
+from its marker and the elbow 40 mm from its own (both as in ``benchmarks/kinect_vs_vicon.py``); the wrist is 40 mm wide
+and the hand 30 mm thick, Vicon's values before they are measured, as is a shoulder offset of 50 mm if one acromion is
+not seen. The splines are cubic, Vicon's quintic.
 
-Where not to trust it. The elbow is set off from ELB at a right angle to the plane of shoulder, ELB and wrist, which is
-along the flexion axis only while the elbow is bent. Of a straight arm in a T-pose, palm down and the markers in their
-places, Plug-in Gait makes a flexion of 27 degrees and an elbow that is off by 64 mm; of a true flexion of 30 degrees 37
-(16 mm), of 60 degrees 63 (7 mm), of 90 degrees 91 (3 mm). What Vicon writes is computed so, too.
+Limits of validity. The elbow is offset from ELB perpendicular to the plane of shoulder, ELB and wrist, which is the
+flexion axis only while the elbow is bent. For a straight arm in a T-pose, palm down and the markers well placed,
+Plug-in Gait gives a flexion of 27 degrees and an elbow that is off by 64 mm; for a true flexion of 30 degrees 37 (16
+mm), of 60 degrees 63 (7 mm), of 90 degrees 91 (3 mm). This is true of Vicon's output, too.
 """
 
 from __future__ import annotations
@@ -53,21 +53,21 @@ from body_tracking.evaluation.smoothing import LONGEST_GAP, fill_gaps, runs, smo
 
 THORAX_MARKERS = ("C7", "T10", "CLAV", "STRN")
 ARM_MARKERS = ("SHO", "ELB", "WRA", "WRB")
-"""Without L and R."""
+"""Names without the prefix L or R."""
 MARKERS: tuple[str, ...] = (
     *("LFHD", "RFHD", "LBHD", "RBHD"),
     *THORAX_MARKERS,
     *(side + name for side in "LR" for name in (*ARM_MARKERS, "FIN")),
     *("LASI", "RASI", "LPSI", "RPSI"),
 )
-"""The markers that are used; SACR stands in for LPSI and RPSI. Schlagenhauf 2017, figures 5.4-5.6, table C.1."""
+"""The markers used; SACR replaces LPSI and RPSI. Schlagenhauf 2017, figures 5.4-5.6, table C.1."""
 
 ACROMION_TO_SHOULDER = 0.12
-"""Shoulder centre from the acromion marker, in distances between the acromia."""
+"""Distance of the shoulder centre from the acromion marker, as a share of the distance between the acromia."""
 HALF_ELBOW = 0.040
-"""Elbow centre from the middle of its marker, m."""
+"""Distance of the elbow centre from the middle of its marker, m."""
 SHOULDER_OFFSET, WRIST_WIDTH, HAND_THICKNESS = 0.050, 0.040, 0.030
-"""Vicon's values before they are measured, m."""
+"""Vicon's values before measurement, m."""
 MARKER_DIAMETER = 0.014
 """Vicon's default, m."""
 
@@ -82,10 +82,10 @@ _HIPS = (Joint.HIP_LEFT, Joint.HIP_RIGHT)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurements:
-    """Of a subject, metres, NaN where unknown. Arrays are (2,): left, right.
+    """Measurements of a subject, metres, NaN where unknown. Arrays are (2,): left, right.
 
     Attributes:
-        shoulder_offset: acromion, without its marker, to the shoulder's centre.
+        shoulder_offset: from the acromion (without its marker) to the shoulder's centre.
         elbow_width: between the epicondyles.
         wrist_width: thickness of the wrist under the bar.
         hand_thickness: at the knuckles.
@@ -104,7 +104,7 @@ class Measurements:
 
     @classmethod
     def from_parameters(cls, values: Mapping[str, float]) -> Measurements:
-        """From Vicon's names (``LShoulderOffset`` or ``LeftShoulderOffset`` ...) and millimetres; 0 is unknown."""
+        """From Vicon's names (``LShoulderOffset`` or ``LeftShoulderOffset`` ...), in millimetres; 0 means unknown."""
 
         def value(*names: str) -> float:
             return next((1e-3 * values[name] for name in names if values.get(name, 0.0) > 0.0), np.nan)
@@ -124,7 +124,7 @@ class Measurements:
         )
 
     def completed(self, markers: Mapping[str, FloatArray]) -> tuple[Measurements, tuple[str, ...]]:
-        """The same with estimates (module docstring) of unknown measurements, and the names of these.
+        """The measurements with estimates (module docstring) of unknown ones, and the names of the estimated ones.
 
         Leg lengths are not estimated.
 
@@ -157,7 +157,7 @@ class Measurements:
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """A marker that is not seen for so long that nothing is made up for it; ends are stamps of unseen frames, s."""
+    """A gap of a marker that is too long to be filled; ends are stamps of the first and last unseen frame, s."""
 
     marker: str
     first: float
@@ -169,15 +169,15 @@ class Gap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MarkerTruth:
-    """What the markers of one subject tell.
+    """Joint centres of one subject from markers.
 
     Attributes:
-        stamps: (n,) s since the start of the trial, of which the file may be a part.
+        stamps: (n,) s since the start of the trial; the file may contain a part of it.
         positions: (n, 25, 3) metres, z up, in the axes of the marker system; NaN where unknown.
-        missing: the names of :data:`MARKERS` that the file does not hold or that are never seen.
-        gaps: what was left open.
-        measurements: those used.
-        estimated: the names of the measurements that are estimates.
+        missing: names of :data:`MARKERS` that the file does not contain or that are never seen.
+        gaps: gaps that were not filled.
+        measurements: used for the centres.
+        estimated: names of the estimated measurements.
     """
 
     stamps: FloatArray
@@ -199,13 +199,13 @@ def read_plug_in_gait(
 
     Args:
         path: of the file.
-        subject: the prefix of the markers' names (``subject:LSHO``); needed where the file holds several subjects.
-        measurements: instead of those in the file, such as :func:`read_measurements` gives.
-        smoothing: of the trajectories; without it, only gaps are filled.
+        subject: prefix of the markers' names (``subject:LSHO``); needed if the file contains several subjects.
+        measurements: replace those in the file, e.g. from :func:`read_measurements`.
+        smoothing: whether to smooth the trajectories; gaps are always filled.
 
     Raises:
-        MarkerError: no C3D file, one that is cut off, without the markers of the thorax and of an arm, several
-            subjects and none chosen, nothing but gaps, or ezc3d is not installed.
+        MarkerError: not a C3D file, a truncated one, no markers of the thorax and of an arm, several subjects and none
+            chosen, nothing but gaps, or ezc3d is not installed.
     """
     path = Path(path)
     trial = read_trial(path, subject, MARKERS)
@@ -235,10 +235,10 @@ def read_plug_in_gait(
 
 
 def read_measurements(path: Path | str) -> Measurements:
-    """From the subject file (.vsk) that Vicon keeps beside its recordings.
+    """Read the subject file (.vsk) that Vicon stores beside its recordings.
 
     Raises:
-        MarkerError: no such file, not XML, or none of the measurements in it.
+        MarkerError: no such file, not XML, or no measurements in it.
     """
     try:
         with open_regular(Path(path)) as stream:
@@ -262,17 +262,17 @@ def read_measurements(path: Path | str) -> Measurements:
 def chord(distance: FloatArray | float, joint: FloatArray, marker: FloatArray, towards: FloatArray) -> FloatArray:
     """Plug-in Gait's chord function: the joint centre next to a marker.
 
-    It lies ``distance`` from the marker, sees the other joint and the marker under a right angle, and lies in the plane
-    of ``joint``, ``marker`` and ``towards``, on the side of the latter.
+    The centre lies ``distance`` from the marker, the angle there between the other joint and the marker is a right
+    angle, and the centre is in the plane of ``joint``, ``marker`` and ``towards``, on the side of ``towards``.
 
     Args:
         distance: (...) m, marker to centre.
         joint: (..., 3) centre of the joint at the other end of the segment.
         marker: (..., 3).
-        towards: (..., 3).
+        towards: (..., 3) point that selects the side.
 
     Returns:
-        (..., 3), NaN where the joint is nearer to the marker than ``distance``.
+        (..., 3) centre; NaN where the joint is nearer to the marker than ``distance``.
     """
     span = joint - marker
     length = np.linalg.norm(span, axis=-1, keepdims=True)
@@ -285,11 +285,11 @@ def chord(distance: FloatArray | float, joint: FloatArray, marker: FloatArray, t
 
 
 def joint_centres(markers: Mapping[str, FloatArray], measurements: Measurements) -> FloatArray:
-    """Joint centres as described in the module's docstring; the truth of Jatesiktat et al. (2018), section IV-A.
+    """Joint centres by the module's docstring; the truth of Jatesiktat et al. (2018), section IV-A.
 
     Args:
         markers: (n, 3) metres each; all of :data:`MARKERS`, NaN where unknown.
-        measurements: NaN where unknown; what depends on these is unknown, but for the hips.
+        measurements: NaN where unknown; joints that depend on them are then unknown, except the hips.
 
     Returns:
         (n, 25, 3) metres, NaN where unknown.
@@ -337,7 +337,7 @@ def joint_centres(markers: Mapping[str, FloatArray], measurements: Measurements)
 
 
 def _hips(anterior: FloatArray, posterior: FloatArray, measurements: Measurements) -> FloatArray:
-    """(n, 2, 3) m from the (n, 2, 3) markers of the spines of the ilium."""
+    """(n, 2, 3) hip centres in m from the (n, 2, 3) markers of the iliac spines."""
     y = _unit(anterior[:, 0] - anterior[:, 1])
     middle = anterior.mean(axis=1)
     x = _rejected(middle - posterior.mean(axis=1), y)
@@ -389,5 +389,5 @@ def _unit(vectors: FloatArray) -> FloatArray:
 
 
 def _rejected(vectors: FloatArray, axis: FloatArray) -> FloatArray:
-    """Unit vectors of what is at a right angle to a unit axis."""
+    """Unit vectors of the components perpendicular to a unit axis."""
     return _unit(vectors - (vectors * axis).sum(axis=-1, keepdims=True) * axis)

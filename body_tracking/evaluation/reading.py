@@ -1,4 +1,4 @@
-"""Reads a person's skeletons, joint angles and calibration from recordings, estimated and true."""
+"""Reads a person's estimated and true skeletons, joint angles and calibration from recordings."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from body_tracking.recording.rosbag2 import BagReader, RawMessage, deserialize
 _PREFIX, _SUFFIX = "/humans/bodies/", "/joint_states"
 _MATCH_NS = NANOSECONDS // 50
 _EXACT, _AMPLIFIED = 1e-6, 10.0
-"""Assumed error of the true pose, radians; true angles that amplify it by more than the factor do not count."""
+"""Assumed error of the true pose, radians; true angles that amplify it by more than the factor are ignored."""
 
 
 class EvaluationError(BodyTrackingError):
@@ -66,7 +66,7 @@ class Tracked:
         body: the person's id.
         angles: estimated.
         skeletons: filtered, in time order; may be empty.
-        true_angles: None where the recording has no truth.
+        true_angles: None if the recording has no truth.
         true_skeletons: in time order; may be empty.
     """
 
@@ -79,16 +79,16 @@ class Tracked:
 
     @property
     def duration(self) -> float:
-        """Seconds from the first angle to the last."""
+        """Seconds from the first to the last angle."""
         return float(self.angles.stamps_ns[-1] - self.angles.stamps_ns[0]) / NANOSECONDS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorClaims:
-    """One sensor's published poses and clock over time; stamps in nanoseconds of the reference clock.
+    """Published poses and clock offsets of one sensor over time; stamps in nanoseconds of the reference clock.
 
     Attributes:
-        pose_stamps_ns: (n,) from which each pose holds.
+        pose_stamps_ns: (n,) start of each pose's validity.
         rotations: (n, 3, 3) sensor to world.
         translations: (n, 3) metres.
         clock_stamps_ns: (c,).
@@ -112,11 +112,11 @@ class Recorded:
         frame_id: of the positions.
         stamps_ns: (n,) capture times, increasing, nanoseconds.
         positions: (n, 25, 3) metres, NaN where unknown.
-        covariances: (n, 25, 3, 3) square metres, NaN where unknown; None where none are stated.
-        angles: None for none.
+        covariances: (n, 25, 3, 3) square metres, NaN where unknown; None if not stated.
+        angles: None if there are none.
         sensors: calibration by sensor.
-        coordinates: of ``kinematics.upper_body``, as in ``/filtered/model_state``; None for none.
-        warnings: problems of the file, a line each.
+        coordinates: of ``kinematics.upper_body``, as in ``/filtered/model_state``; None if there are none.
+        warnings: problems of the file, one per line.
     """
 
     source: Path
@@ -132,7 +132,7 @@ class Recorded:
 
     @property
     def joints(self) -> BoolArray:
-        """(25,) joints that are known in any frame."""
+        """(25,) joints known in any frame."""
         return np.asarray(np.isfinite(self.positions).all(axis=-1).any(axis=0))
 
     def seconds(self, zero_ns: int) -> FloatArray:
@@ -145,8 +145,8 @@ def read(path: Path, body: str | None = None, truth: Path | None = None) -> Trac
 
     Args:
         path: a bag folder or an mcap file.
-        body: the person's id; the first one in the bag where None.
-        truth: the bag with the truth; this one where None.
+        body: the person's id; None for the first one in the bag.
+        truth: the bag with the truth; None for this one.
 
     Raises:
         BagError: no such bag, or it is unreadable.
@@ -178,12 +178,11 @@ def true_angles(names: tuple[str, ...], own: AngleSeries | None, coordinates: An
 
     Args:
         names: of the evaluated angles.
-        own: the true angles of a recording, of ``kinematics.positional``; None for none.
-        coordinates: the true coordinates of the body model; None for none.
+        own: the true angles of a recording, of ``kinematics.positional``; None if there are none.
+        coordinates: the true coordinates of the body model; None if there are none.
 
     Returns:
-        Angles computed from the coordinates, if there are any and the names are of a convention of the model; else
-        ``own``.
+        Angles computed from the coordinates if there are any and the names are those of a convention; else ``own``.
     """
     if coordinates is None:
         return own
@@ -192,7 +191,7 @@ def true_angles(names: tuple[str, ...], own: AngleSeries | None, coordinates: An
     if names not in of_names or coordinates.names != model.coordinate_names:
         return own
     exact = _EXACT**2 * np.eye(2 * model.nv)
-    lengths = model.default_lengths()  # no angle depends on them
+    lengths = model.default_lengths()  # angles do not depend on them
     rates = np.zeros(model.nv)
     series: list[JointAngles] = []
     for stamp_ns, tangent in zip(coordinates.stamps_ns, coordinates.position, strict=True):
@@ -209,7 +208,7 @@ def true_angles(names: tuple[str, ...], own: AngleSeries | None, coordinates: An
 
 
 def bodies(bag: BagReader) -> tuple[str, ...]:
-    """The ids of the people with joint angles in a bag, sorted."""
+    """The ids of people with joint angles in a bag, sorted."""
     return tuple(
         sorted(
             topic.removeprefix(_PREFIX).removesuffix(_SUFFIX)
@@ -223,8 +222,8 @@ def read_angles(bag: BagReader, body: str | None = None) -> tuple[str, AngleSeri
     """A person's id and measured angles.
 
     Args:
-        bag: with the joint angles of at least one of :func:`bodies`.
-        body: the person's id; the first one in the bag where None.
+        bag: with joint angles of at least one of :func:`bodies`.
+        body: the person's id; None for the first one in the bag.
 
     Raises:
         EvaluationError: no readable joint angles of this person.
@@ -240,7 +239,7 @@ def read_angles(bag: BagReader, body: str | None = None) -> tuple[str, AngleSeri
 
 
 def read_joint_states(bag: BagReader, topic: str, body: str) -> AngleSeries | None:
-    """A topic's positions in time order; messages with other names than the first are left out.
+    """A topic's positions in time order; messages with other names than the first are ignored.
 
     Returns:
         A series with zero standard deviations and names without the body's id; None without messages.
@@ -261,7 +260,7 @@ def read_joint_states(bag: BagReader, topic: str, body: str) -> AngleSeries | No
 
 
 def _with_stddev(values: AngleSeries, deviations: AngleSeries | None) -> AngleSeries:
-    """Values with the deviations of the same stamp, or infinity."""
+    """Values with the standard deviations of equal stamps, else infinity."""
     stddev = np.full_like(values.position, np.inf)
     if deviations is not None and deviations.names == values.names:
         _, here, there = np.intersect1d(values.stamps_ns, deviations.stamps_ns, return_indices=True)
@@ -271,7 +270,7 @@ def _with_stddev(values: AngleSeries, deviations: AngleSeries | None) -> AngleSe
 
 
 def read_frames(bag: BagReader, topic: str) -> dict[int, tuple[Skeleton, ...]]:
-    """The bodies of a topic's messages by stamp, in time order; malformed messages are left out."""
+    """The bodies of a topic's messages by stamp, in time order; malformed messages are ignored."""
     frames = {}
     for raw in _messages(bag, topic, POINT_CLOUD):
         try:
@@ -283,12 +282,12 @@ def read_frames(bag: BagReader, topic: str) -> dict[int, tuple[Skeleton, ...]]:
 
 
 def read_skeletons(bag: BagReader, topic: str) -> tuple[Skeleton, ...]:
-    """The first body of each of a topic's messages, in time order; empty without such a topic."""
+    """The first body of each message, in time order; empty if there is no such topic."""
     return tuple(skeletons[0] for skeletons in read_frames(bag, topic).values())
 
 
 def nearest(stamps_ns: IntArray, wanted_ns: IntArray, within_ns: int = _MATCH_NS) -> IntArray:
-    """Index of the nearest of (n,) sorted stamps for each of (m,) wanted ones; -1 where none is near enough."""
+    """Index of the nearest of (n,) sorted stamps for each of (m,) wanted ones; -1 if farther than ``within_ns``."""
     after = np.clip(np.searchsorted(stamps_ns, wanted_ns), 1, max(len(stamps_ns) - 1, 1))
     before = after - 1
     after = np.minimum(after, len(stamps_ns) - 1)
@@ -299,7 +298,7 @@ def nearest(stamps_ns: IntArray, wanted_ns: IntArray, within_ns: int = _MATCH_NS
 
 
 def true_at(angles: AngleSeries, truth: AngleSeries | None) -> FloatArray:
-    """(n, m) the truth within 20 ms of the stamps of the angles; NaN where there is none."""
+    """(n, m) truth within 20 ms of the angles' stamps; NaN if there is none."""
     true = np.full_like(angles.position, np.nan)
     if truth is not None:
         matches = nearest(truth.stamps_ns, angles.stamps_ns)
@@ -317,11 +316,11 @@ def read_estimate(path: Path, topic: str | None = None, body: str | None = None)
 
     Args:
         path: a bag folder or an mcap file.
-        topic: of the skeletons; where None ``/filtered/skeleton``, or ``/fused/skeleton`` where that is missing.
-        body: whose angles; the first in the bag where None.
+        topic: of the skeletons; None for ``/filtered/skeleton``, or ``/fused/skeleton`` if that is missing.
+        body: id of the person whose angles are read; None for the first one in the bag.
 
     Raises:
-        BagError: no such bag, or nothing of it can be read.
+        BagError: no such bag, or it is unreadable.
         EvaluationError: the topic is missing, empty or of another type, or there are no angles of this person.
     """
     with RigReader(path) as bag:
@@ -343,10 +342,10 @@ def read_truth(path: Path, body: str | None = None) -> Recorded:
 
     Args:
         path: a bag folder or an mcap file.
-        body: the id that ends the names of its angles; any where None.
+        body: the id at the end of the angles' names; None for any.
 
     Raises:
-        BagError: no such bag, or nothing of it can be read.
+        BagError: no such bag, or it is unreadable.
         EvaluationError: it holds no true skeletons.
     """
     with RigReader(path) as bag:
@@ -361,12 +360,12 @@ def read_truth(path: Path, body: str | None = None) -> Recorded:
 
 
 def read_markers(path: Path, subject: str | None = None, measurements: Path | None = None) -> Recorded:
-    """Joint centres from markers as the truth, with a clock and a frame of its own.
+    """Joint centres from markers as the truth, with its own clock and frame.
 
     Args:
         path: a C3D file with the markers of Plug-in Gait.
-        subject: required where the file has several.
-        measurements: Vicon's file of the subject's measurements; those in the C3D file where None.
+        subject: required if the file has several.
+        measurements: Vicon's file of the subject's measurements; None for those in the C3D file.
 
     Raises:
         MarkerError: unreadable files, or too few markers.
@@ -381,7 +380,7 @@ def read_markers(path: Path, subject: str | None = None, measurements: Path | No
 
 
 def truth_of_markers(source: Path, stamps: FloatArray, positions: FloatArray) -> Recorded:
-    """Joint centres as the truth, with a clock and a frame of its own.
+    """Joint centres as the truth, with its own clock and frame.
 
     Args:
         source: the file.
@@ -411,7 +410,7 @@ def _recorded(bag: BagReader, topic: str, advice: str) -> Recorded:
     skeletons = [bodies_there[0] for bodies_there in frames.values()]
     people = max(map(len, frames.values()))
     crowd = (f"{bag.path}: {topic} holds {people} people, only the first is compared",) if people > 1 else ()
-    # infinite covariances become NaN: a rotation would spread infinity over all elements
+    # infinite covariances become NaN: rotating a matrix spreads infinity over all elements
     stated = [
         np.where(np.isfinite(each.covariances), each.covariances, np.nan)
         for each in skeletons
@@ -449,6 +448,6 @@ def _sensors(bag: BagReader, pose_topic: str, clock_topic: str) -> dict[str, Sen
 
 
 def _messages(bag: BagReader, topic: str, kind: str) -> Iterator[RawMessage]:
-    """A topic's messages; none where it is missing or of another type."""
+    """A topic's messages; none if it is missing or of another type."""
     there = topic in bag.topics and bag.topics[topic].type_name == kind
     return bag.messages([topic]) if there else iter(())

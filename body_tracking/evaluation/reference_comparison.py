@@ -1,8 +1,8 @@
-"""Judges an estimated person by a recording of the marker system, whose clock, frame and targets are its own.
+"""Evaluates an estimated person by a recording of the marker system, which has its own clock, frame and targets.
 
-The clock is found by the angular speeds of the segments, which need neither frame nor mounting; then mountings, world
-and clock together (:mod:`body_tracking.evaluation.hand_eye`). What is fitted to one half of the recording is used to
-compare the other half, and the other way round, so that no error is fitted away.
+The clock is initialised from the angular speeds of the segments, which need neither frame nor mounting; then mountings,
+world and clock are fitted together (:mod:`body_tracking.evaluation.hand_eye`). The fit of each half of the recording
+serves to compare the other half (cross-validation), so that no error is fitted away.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from body_tracking.kinematics.conventions import Chain
 from body_tracking.kinematics.upper_body import PARENTS, UpperBody
 
 LEAST_OVERLAP: Final = 10.0
-"""Seconds that both recordings must cover."""
+"""Least overlap of both recordings, seconds."""
 _AMPLIFIED: Final = 10.0
-"""Near a singular pose: an angle that changes by more than this per radian of rotation is not compared."""
+"""Radians of angle per radian of rotation above which an angle is not compared: the pose is nearly singular."""
 _WORLD: Final = "world"
 
 
@@ -42,18 +42,18 @@ class ReferenceEvaluation:
     """An estimate against the marker system.
 
     Attributes:
-        estimate: the judged segments and angles.
-        reference: the recording of the marker system.
+        estimate: evaluated segments and angles.
+        reference: recording of the marker system.
         targets: names of the compared targets, in the order of ``fit``.
-        fit: mountings, world and clock by the whole recording.
+        fit: mountings, world and clock from the whole recording.
         offset_s: targets' clock minus the estimate's at the middle, by the stamps of both.
-        clock_stddev: s, of that.
-        seconds: that both cover.
-        mountings_known: by name, those known from elsewhere.
-        orientations: of each mounted segment in its next mounted ancestor, and of those without one in world.
+        clock_stddev: s, of ``offset_s``.
+        seconds: covered by both.
+        mountings_known: by target, mountings known beforehand.
+        orientations: of each mounted segment in its nearest mounted ancestor, or in world if it has none.
         angles: of the estimate's convention.
         curves: angles of both over time, by the mountings of the other half.
-        notes: a line each.
+        notes: one per line.
     """
 
     estimate: EstimatedSegments
@@ -87,13 +87,13 @@ def evaluate_by_markers(
     *,
     one_clock: bool = False,
 ) -> ReferenceEvaluation:
-    """Judge an estimate by the marker system.
+    """Evaluate an estimate by the marker system.
 
     Args:
         estimate: of one person.
         reference: targets on the same person.
-        known_mountings: of some targets, from another recording of the same targets on the same person.
-        one_clock: where the motion does not determine the offset of the clocks, take the stamps as they are.
+        known_mountings: by target, from another recording of these targets on this person.
+        one_clock: use the stamps unchanged if the motion does not determine the offset of the clocks.
 
     Raises:
         EvaluationError: the angular speeds determine no clock, too little overlap, or a motion that determines neither
@@ -179,7 +179,7 @@ def _start_clock(
     targets: Sequence[str],
     one_clock: bool,
 ) -> tuple[ClockModel, list[str]]:
-    """The targets' clock against the estimate's, both from their first stamps, by the angular speeds; and notes."""
+    """The targets' clock relative to the estimate's, each from its first stamp, from angular speeds; and notes."""
     own = {target: estimate.track(rotations[:, number]) for number, target in enumerate(targets)}
     apart = (int(estimate.stamps_ns[0]) - reference.first_ns) / NANOSECONDS
     length, other = float(estimate.seconds[-1]), max(float(track.times[-1]) for track in reference.tracks.values())
@@ -212,7 +212,7 @@ def _pairs(mounted: Iterable[str]) -> list[tuple[str, str | None]]:
 
 
 class _Compared:
-    """One half of the recording by the mountings of the other."""
+    """One half of the recording with the mountings fitted to the other."""
 
     def __init__(
         self,
@@ -254,7 +254,7 @@ class _Compared:
         return true, found, self.known[:, c] & self.known[:, p]
 
     def uncertainty(self, parent: str | None, child: str) -> tuple[FloatArray, FloatArray]:
-        """(n, 3, 3) square radians in the child's frame: by noise and clock, and by the mountings."""
+        """(n, 3, 3) covariances in the child's frame, square radians: by noise and clock, and by the mountings."""
         c, size = self.number[child], len(self.fit.covariance)
         back = self.relative(parent, child)[0].swapaxes(-1, -2)
         derivative = np.zeros((len(self.times), 3, size))
@@ -267,7 +267,7 @@ class _Compared:
             derivative[..., 3 * p : 3 * p + 3] = -back
             noise = noise + back @ self.noise[:, p] @ back.swapaxes(-1, -2)
             rates = rates - (back @ self.rates[:, p, :, None])[..., 0]
-        # what the marker system states of its angles has the calibration of the cameras in it, too
+        # the stated deviation of the marker system's angles includes the calibration of the cameras
         more = np.maximum(self.stated - np.trace(noise, axis1=-2, axis2=-1) / 3.0, 0.0)
         own = noise + more[:, None, None] * np.eye(3)
         own = own + self.clock[:, None, None] * rates[..., :, None] * rates[..., None, :]
@@ -283,13 +283,13 @@ class _Compared:
     def angle(
         self, chain: Chain, near: FloatArray, column: int, stated: FloatArray
     ) -> tuple[Differences, FloatArray, BoolArray]:
-        """Differences of an angle, the reference's angle (n,), and (n,) which of them are compared.
+        """Differences of an angle, the reference's angle (n,), and (n,) mask of the compared instants.
 
         Args:
             chain: of the angle.
             near: (n, 3) radians of the estimate, NaN where unknown.
-            column: of the angle.
-            stated: (n,) radians.
+            column: index of the angle in the chain.
+            stated: (n,) the estimate's standard deviation, radians.
         """
         true, _, known = self.relative(chain.parent, chain.child)
         known = known & np.isfinite(near).all(axis=1)
@@ -348,7 +348,7 @@ def _angles(
 
 
 def _rows(stamps_ns: IntArray, wanted_ns: IntArray) -> IntArray:
-    """(n,) row of each wanted stamp; -1 for none."""
+    """(n,) row of each wanted stamp; -1 if there is none."""
     index = np.clip(np.searchsorted(stamps_ns, wanted_ns), 0, len(stamps_ns) - 1)
     result: IntArray = np.where(stamps_ns[index] == wanted_ns, index, -1)
     return result

@@ -1,17 +1,17 @@
-"""The error of an estimate from its difference to a reference that errs itself.
+"""The error of an estimate from its difference to an imperfect reference.
 
-The difference is e = (error of the estimate) - (error of the reference), and both are independent, so that
+The difference is e = (error of the estimate) - (error of the reference). Both are independent, so
 
     mean |error of the estimate|^2 = mean |e|^2 - V                                                                 (1)
 
-with the variance V that the reference states: noise of its poses, its clock, the mountings of its targets. The interval
-is that of a variance (Satterthwaite 1946): chi squared with as many degrees of freedom as the scatter of |e|^2 gives,
-where samples count by their autocorrelation and an error of a mounting is one draw for a whole half.
+with V the variance stated by the reference: noise of its poses, its clock, the mountings of its targets. The interval
+is that of a variance (Satterthwaite 1946): chi squared with degrees of freedom from the scatter of |e|^2, where samples
+count by their autocorrelation and a mounting error is one draw per half.
 
-A mounting that is fitted to one half has the estimate's mean error there in it, whose variance the autocorrelation
-within a half tells only of errors that change within it. Errors that last longer show as the change of the mean from
-one half to the other: each half is compared by the mountings of the other, so that the change c is the difference of
-both means, and c c^T / 2 what one draw says of the variance of each. What it exceeds the stated variance by is added.
+A mounting fitted to one half contains the estimate's mean error there. The autocorrelation within a half gives the
+variance of only those errors that change within it. More persistent errors show as a change of the mean between the
+halves: each half is compared by the mountings of the other, so that the change c is the difference of both means, and
+c c^T / 2 a one-draw estimate of the variance of each. Its excess over the stated variance is added.
 """
 
 from __future__ import annotations
@@ -27,8 +27,9 @@ from body_tracking.calibration.clock_correlation import correlation_time
 from body_tracking.core.skeleton import BoolArray, FloatArray
 
 TOO_POOR: Final = 0.5
-"""Share of the reference's deviation in the measured difference from which on no error is stated. At half, eq. 1 takes
-13 % off the difference; beyond, an error of the stated deviation by a fifth changes the result by more than 7 %."""
+"""Ratio of the reference's deviation to the measured difference, above which no error is stated. At one half, eq. 1
+reduces the difference by 13 %; above, an error of the stated deviation by a fifth changes the result by more than 7
+%."""
 _LEVEL: Final = 0.95
 _NORMAL: Final = 1.96
 
@@ -41,8 +42,8 @@ class Differences:
         step: seconds between samples.
         errors: (n, d) radians, estimate minus reference.
         variance: (n,) square radians, summed over d: of the reference's noise and clock.
-        mounting: (n, d, d) square radians: covariance by the mountings; the same draw at all n.
-        stated: (n,) radians that the estimate states; None for none.
+        mounting: (n, d, d) square radians: covariance by the mountings; one draw for all n.
+        stated: (n,) standard deviation stated by the estimate, radians; None if there is none.
     """
 
     step: float
@@ -57,17 +58,17 @@ class Judged:
     """One quantity of the estimate against the reference; radians.
 
     Attributes:
-        name: of it.
-        samples: compared.
+        name: of the quantity.
+        samples: number compared.
         measured: RMS difference.
-        reference: RMS deviation of the reference, root of V.
-        error: RMS error of the estimate by eq. 1; NaN where the reference is too poor.
-        low, high: its 95 % interval; NaN and that of the difference where the reference is too poor.
-        offset: mean difference, a length for orientations; NaN where mountings are fitted, which absorb it.
+        reference: RMS standard deviation of the reference, root of V.
+        error: RMS error of the estimate by eq. 1; NaN if the reference is too poor.
+        low, high: 95 % interval of the error; NaN and the difference's upper bound if the reference is too poor.
+        offset: mean difference, a length for orientations; NaN if the mountings are fitted, which absorb it.
         offset_stddev: of the offset.
-        change: mean difference in the second half less that in the first, half of it as each half is measured by the
-            mountings of the other.
-        covered: share of differences within 1.96 of the deviation that estimate and reference state; NaN for none.
+        change: half of the mean difference in the second half minus that in the first; half, because each half is
+            measured by the mountings of the other.
+        covered: share of differences within 1.96 combined standard deviations of estimate and reference; NaN if none.
     """
 
     name: str
@@ -89,15 +90,16 @@ class Judged:
 
 
 def judge(name: str, parts: Sequence[Differences], *, mountings_known: bool) -> Judged | None:
-    """Judge a quantity by its differences in the parts of a recording.
+    """Evaluate a quantity by its differences in the parts of a recording.
 
     Args:
-        name: of it.
+        name: of the quantity.
         parts: the first half, by the mountings of the second, and the second by those of the first.
-        mountings_known: the mountings are known from elsewhere: the same errors in all parts, and offsets show.
+        mountings_known: whether the mountings are known beforehand: then their errors are equal in all parts, and
+            offsets are observable.
 
     Returns:
-        None without samples in some part.
+        The result; None if some part has fewer than two samples.
     """
     count = np.array([len(part.errors) for part in parts])
     if not count.min() > 1:
@@ -123,7 +125,7 @@ def judge(name: str, parts: Sequence[Differences], *, mountings_known: bool) -> 
     )
     by_mounting = float(share @ np.sqrt(drawn)) ** 2 if mountings_known else float(share**2 @ drawn)
     poor = not np.sqrt(reference) < TOO_POOR * np.sqrt(measured)
-    # for an upper bound without the reference: its errors only add to the difference
+    # the upper bound ignores the reference, whose errors only increase the difference
     scatter = float(share**2 @ sampling) + (0.0 if poor else by_mounting)
     freedom = max(2.0 * measured**2 / max(scatter, 1e-30), 1.0)
     tail = 0.5 * (1.0 - _LEVEL)
@@ -146,12 +148,12 @@ def judge(name: str, parts: Sequence[Differences], *, mountings_known: bool) -> 
 
 
 def _lasting(change: FloatArray, parts: Sequence[Differences], mountings: Sequence[FloatArray]) -> FloatArray:
-    """(d, d) by how much the change (d,) of the mean exceeds what mountings and samples state, as variance of a mean.
+    """(d, d) excess of the change (d,) over the stated variances of mountings and samples, as variance of a mean.
 
     Args:
-        change: of the mean, half of the difference of both halves' means.
+        change: of the mean: half the difference of both halves' means.
         parts: both halves.
-        mountings: (d, d) the stated covariance of each by its mountings.
+        mountings: (d, d) covariance of each half by its mountings.
     """
     size = float(np.linalg.norm(change))
     direction = change / max(size, 1e-12)
@@ -164,7 +166,7 @@ def _lasting(change: FloatArray, parts: Sequence[Differences], mountings: Sequen
 
 
 def _signed(vector: FloatArray) -> float:
-    """A difference of angles as it is, one of orientations as a length."""
+    """A difference of angles with its sign, one of orientations as a length."""
     return float(vector[0]) if len(vector) == 1 else float(np.linalg.norm(vector))
 
 

@@ -1,4 +1,4 @@
-"""The reports of evaluations by a reference that errs itself: the marker system, or another estimate."""
+"""Reports of evaluations by an imperfect reference: the marker system, or another estimate."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _COVERED = "in 95%: share of differences within 1.96 of the deviation that estim
 
 _COLUMNS = {"difference": "measured", "reference": "reference", "error": "error", "from": "low", "to": "high"}
 _OFFSETS = {"offset": "offset", "+-": "offset_stddev"}
-"""Fields of :class:`Judged` by the titles of their columns; the second ones where mountings are known."""
+"""Fields of :class:`Judged` by their columns' titles; ``_OFFSETS`` only if the mountings are known."""
 
 
 def _judged_table(key: str, title: str, rows: tuple[Judged, ...], known: bool, note: str) -> Table:
@@ -72,7 +72,7 @@ def tables(result: ReferenceEvaluation) -> tuple[Table, ...]:
 
 
 def _in_words(name: str, rows: tuple[Judged, ...]) -> list[tuple[str, str]]:
-    """The errors of the rows, without what the reference takes in them, and how true the stated deviations are."""
+    """Summary lines: errors of the rows with a good enough reference, and coverage of the stated deviations."""
     known = [row for row in rows if not row.too_poor]
     lines = [
         f"{len(known)} of {len(rows)} for which the reference is good enough",

@@ -1,4 +1,4 @@
-"""Writes the results of an evaluation: tables on a terminal, JSON and one page of HTML."""
+"""Report of an evaluation: tables on a terminal, JSON and one HTML page."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ THESIS_JOINTS = (
     *(Joint.SHOULDER_LEFT, Joint.ELBOW_LEFT, Joint.WRIST_LEFT, Joint.HAND_TIP_LEFT),
     *(Joint.SHOULDER_RIGHT, Joint.ELBOW_RIGHT, Joint.WRIST_RIGHT, Joint.HAND_TIP_RIGHT),
 )
-"""The ten over which the thesis averages (section 5.7.2, tables 5.3 and E.1)."""
+"""The ten joints over which the thesis averages (section 5.7.2, tables 5.3 and E.1)."""
 
 
 def _rms(values: FloatArray) -> float:
@@ -37,8 +37,8 @@ class Column(NamedTuple):
         title: in text.
         unit: mm, deg, % or ms.
         values: (rows,) in the unit; NaN for no value.
-        pool: combines rows into one.
-        digits: behind the point in text.
+        pool: function that combines rows into one.
+        digits: decimals in text.
     """
 
     key: str
@@ -65,7 +65,7 @@ class Table:
     note: str = ""
 
     def row(self, name: str) -> dict[str, float]:
-        """The numbers of a row by the keys of their columns."""
+        """The numbers of a row by column key."""
         return {column.key: float(column.values[self.names.index(name)]) for column in self.columns}
 
     def text(self) -> str:
@@ -82,7 +82,7 @@ class Table:
         return "\n".join([header, units, "-" * len(header), *others])
 
     def pooled(self, groups: dict[str, IntArray], rows: IntArray) -> Table:
-        """The given rows, and a pooled row for each group."""
+        """A table of the given rows, plus a pooled row per group."""
 
         def values(column: Column) -> FloatArray:
             known = [column.values[group][np.isfinite(column.values[group])] for group in groups.values()]
@@ -94,14 +94,14 @@ class Table:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Report:
-    """The results of an evaluation, to be written.
+    """The results of an evaluation, for output.
 
     Attributes:
         name: of the estimate.
-        facts: about the whole recording, names and values.
-        content: the same for JSON.
+        facts: names and values for the whole recording.
+        content: the facts for JSON.
         tables: all results.
-        hidden: keys of the tables that text leaves out.
+        hidden: keys of the tables omitted in text.
     """
 
     name: str
@@ -111,7 +111,7 @@ class Report:
     hidden: frozenset[str] = frozenset()
 
     def lines(self) -> str:
-        """The facts, a line each."""
+        """The facts, one per line."""
         return "\n".join(f"{name:<9} {value}" for name, value in self.facts)
 
     def text(self) -> str:
@@ -146,7 +146,7 @@ class Report:
 
 
 def report_of(result: Evaluation) -> Report:
-    """The report of an evaluation; its text leaves out named angles that repeat those of the skeletons."""
+    """The report of an evaluation; its text omits named angles that repeat those of the skeletons."""
     content = {
         "estimate": str(result.estimate.source),
         "topic": result.estimate.topic,
@@ -174,7 +174,7 @@ def tables(result: Evaluation) -> tuple[Table, ...]:
 
 
 def named_are_positional(result: Evaluation) -> bool:
-    """Whether the estimate's own angles are those computed from its skeletons."""
+    """Whether the estimate's own angles are those computed from skeletons."""
     angles = result.estimate.angles
     return angles is not None and set(angles.names) == set(result.comparisons[0].positional.names)
 
@@ -276,25 +276,25 @@ def _facts(result: Evaluation) -> tuple[tuple[str, str], ...]:
 
 
 def _other_frame(result: Evaluation) -> bool:
-    """Whether alignment brings joints close that are far away as they are."""
+    """Whether alignment brings distant joints close."""
     first, last = (each.joints.rms[each.joints.frames > 0] for each in (result.comparisons[0], result.comparisons[-1]))
     return bool(np.median(first) > BEYOND > np.median(last))
 
 
 def _headline(result: Evaluation) -> Comparison:
-    """The comparison to begin with: as it is, but aligned where estimate and truth have other frames."""
+    """The comparison to summarise: as it is, or aligned if estimate and truth have different frames."""
     return result.comparisons[-1 if _other_frame(result) else 0]
 
 
 def _angles_in_words(result: Evaluation) -> list[str]:
-    """The angles that the estimate states by name, else those of its skeletons."""
+    """Summary lines of the angles that the estimate states by name, else of its skeletons' angles."""
     comparison = _headline(result)
     compared = comparison.named or comparison.positional
     errors = compared.errors
     known, count = errors.frames > 0, f"{len(compared.names)}"
     stated = np.where(np.isfinite(compared.stddev), compared.stddev, np.inf)
     if np.isfinite(stated).any():
-        # as in what replay prints
+        # the same criterion as in the output of replay
         known &= np.median(stated, axis=0) < np.radians(UNKNOWN)
         count = f"{known.sum()} of {count} known (standard deviation below {UNKNOWN:.0f} deg in most frames)"
     names = [name for name, there in zip(compared.names, known, strict=True) if there]
@@ -335,10 +335,10 @@ def numbered(value: float) -> float | None:
 
 
 def make_folder(path: Path) -> None:
-    """Create the folder of a file that will be written, before the seconds that its content takes.
+    """Create the folder of an output file, before the slow computation of its content.
 
     Raises:
-        EvaluationError: it cannot be created.
+        EvaluationError: the folder cannot be created.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -347,10 +347,10 @@ def make_folder(path: Path) -> None:
 
 
 def write(path: Path, content: bytes) -> None:
-    """Write a file, and create its folder if needed.
+    """Write a file, creating its folder if needed.
 
     Raises:
-        EvaluationError: it cannot be written.
+        EvaluationError: the file cannot be written.
     """
     make_folder(path)
     try:

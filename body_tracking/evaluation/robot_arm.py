@@ -1,7 +1,7 @@
-"""A robot arm with three red balls that a colour-and-depth camera tracks (Schlagenhauf 2017, section 4.1.1).
+"""A robot arm with three red balls tracked by a colour-and-depth camera (Schlagenhauf 2017, section 4.1.1).
 
-The robot states where the balls are in its own frame. Delay and rigid registration (eq. 4.1) are fitted on the first
-trial and applied to the others, so that the errors of these are of data that nothing was fitted to.
+The robot states the balls' positions in its own frame. Delay and rigid registration (eq. 4.1) are fitted on the first
+trial and applied to the others, whose errors are therefore independent of the fit.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
 from body_tracking.evaluation.metrics import Alignment, Curve, Trajectory, align, find_delay, grid
 
 BALLS: Final = ("base", "elbow", "end effector")
-"""In the order in which the robot states them."""
+"""Order of the balls in the robot's messages."""
 _PAIRS: Final = tuple(combinations(range(len(BALLS)), 2))
 _UNLIKE: Final = 0.1
-"""Metres by which a distance between balls may differ from the robot's: a delay moves the end effector meanwhile."""
+"""Largest difference between measured and true ball distances, metres: the end effector moves during the delay."""
 _CLEAR: Final = 0.05
-"""Metres by which the distances fit the second best order worse than the best one."""
+"""Least difference between the distance errors of the best and second best order, metres."""
 _LEAST: Final = 30
-"""Images for the registration."""
+"""Least number of images for the registration."""
 _ORDERS: Final = np.array(list(permutations(range(len(BALLS)))))
 _RATE: Final = 30.0
-"""Hz at which trials are compared with their mean."""
+"""Hz: rate at which trials are compared with their mean."""
 _MAX_GAP: Final = 0.1
-"""Seconds between positions from which on nothing is known in between."""
+"""Longest time between positions for interpolation, seconds."""
 _MOVED: Final = 0.01
-"""Metres from its first place from which on the end effector has begun to move."""
+"""Metres from its initial position at which the end effector counts as moving."""
 _SAME: Final = 0.005
-"""Root mean square difference, metres, up to which two trials are of one motion."""
+"""Largest root mean square difference between two trials of one motion, metres."""
 
 
 class ArmError(BodyTrackingError):
-    """Trials of a robot arm that cannot be compared."""
+    """Raised for trials of a robot arm that cannot be compared."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,11 +47,11 @@ class Trial:
 
     Attributes:
         name: of the trial.
-        times: (n,) s, capture times by the camera.
+        times: (n,) s, capture times by the camera's clock.
         positions: (n, 3, 3) metres, the balls in the camera's frame; in the order of :data:`BALLS` after
-            :func:`by_distances` or :func:`by_places`, in any order before.
-        images: number of pairs of images, n of which show three balls.
-        true_times: (m,) s, by the robot.
+            :func:`by_distances` or :func:`by_places`, before in any order.
+        images: number of image pairs, of which n show three balls.
+        true_times: (m,) s, by the robot's clock.
         true_positions: (m, 3, 3) metres, the balls in the robot's frame.
     """
 
@@ -64,33 +64,33 @@ class Trial:
 
     @property
     def truth(self) -> Curve:
-        """The robot's motion, relative to the first time."""
+        """The robot's motion; time counts from :attr:`zero`."""
         return Curve(self.true_times - self.zero, self.true_positions)
 
     @property
     def zero(self) -> float:
-        """The first time of the robot, to which seconds of curves count."""
+        """The robot's first time, at which the curves' time is zero."""
         return float(self.true_times[0])
 
     @property
     def tracked(self) -> Trajectory:
-        """The camera's measurement, likewise."""
+        """The camera's measurement; time counts from :attr:`zero`."""
         return Trajectory(self.times - self.zero, self.positions)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmErrors:
-    """One row of table 4.1 (Schlagenhauf 2017; figures 4.5-4.7, A.1-A.3), of the end effector, metres.
+    """One row of table 4.1 (Schlagenhauf 2017; figures 4.5-4.7, A.1-A.3), for the end effector, metres.
 
     Attributes:
         mae: (3,) mean absolute error along the robot's axes.
         largest: (3,) maximum absolute error.
         deviation: (3,) mean absolute deviation from the mean of all trials (figure 4.8).
         largest_deviation: (3,) maximum absolute deviation.
-        delay: s by which the camera's stamps follow the robot's, by this trial alone; NaN where it cannot be told.
-        times: (n,) s of the first trial's record, delay removed.
-        found: (n, 3) the tracked end effector in the robot's frame.
-        true: (n, 3) the robot's.
+        delay: s by which the camera's stamps lag the robot's, from this trial alone; NaN if unobservable.
+        times: (n,) s on the first trial's time axis, delay removed.
+        found: (n, 3) tracked end effector in the robot's frame.
+        true: (n, 3) the robot's end effector.
     """
 
     mae: FloatArray
@@ -105,11 +105,11 @@ class ArmErrors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmResult:
-    """What the comparison of trials gives.
+    """Result of a comparison of trials.
 
     Attributes:
-        trials: all of them; the first one is that of the fit.
-        alignment: fitted to the first one (eq. 4.1).
+        trials: all trials; the fit uses the first one.
+        alignment: fitted to the first trial (eq. 4.1).
         errors: a row of table 4.1 for each trial.
     """
 
@@ -119,17 +119,17 @@ class ArmResult:
 
 
 def distances(balls: FloatArray) -> FloatArray:
-    """(..., 3) metres between balls (..., 3, 3)."""
+    """(..., 3) distances between balls (..., 3, 3), metres."""
     return np.stack([np.linalg.norm(balls[..., i, :] - balls[..., j, :], axis=-1) for i, j in _PAIRS], axis=-1)
 
 
 def by_distances(trial: Trial) -> Trial:
-    """A trial's balls in the robot's order, by their distances from each other, without delay and registration.
+    """A trial with its balls in the robot's order, from their mutual distances; needs no delay or registration.
 
-    Left out are images in which they have other distances than the robot's, or fit two orders.
+    Images whose distances differ from the robot's, or fit two orders, are left out.
 
     Raises:
-        ArmError: hardly any image is left.
+        ArmError: too few images remain.
     """
     true = distances(trial.true_positions)
     wanted = np.column_stack([np.interp(trial.times, trial.true_times, column) for column in true.T])
@@ -145,7 +145,7 @@ def by_distances(trial: Trial) -> Trial:
 
 
 def by_places(trial: Trial, alignment: Alignment) -> Trial:
-    """A trial's balls in the order in which they are nearest to the robot's, by delay and registration."""
+    """A trial with its balls in the order nearest to the robot's, after delay and registration."""
     true = trial.truth.at(trial.tracked.times - alignment.delay)
     placed = alignment.apply(trial.tracked).positions
     off = np.square(placed[:, _ORDERS] - true[:, None]).sum(axis=(-2, -1))
@@ -154,17 +154,17 @@ def by_places(trial: Trial, alignment: Alignment) -> Trial:
 
 
 def _ordered(trial: Trial, order: IntArray, kept: BoolArray) -> Trial:
-    """The kept images (n,), each with its balls in one of the orders."""
+    """The kept images (n,), each with its balls in the chosen order."""
     positions = trial.positions[np.arange(len(order))[:, None], _ORDERS[order]]
     return replace(trial, times=trial.times[kept], positions=positions[kept])
 
 
 def compare(trials: Sequence[Trial]) -> ArmResult:
-    """Fit delay and registration on the first trial, and report the errors of all (table 4.1).
+    """Fit delay and registration on the first trial, and compute the errors of all trials (table 4.1).
 
     Raises:
-        ArmError: one trial alone, an arm that hardly moves, or trials of other motions.
-        MetricsError: all points on one line.
+        ArmError: a single trial, an arm that hardly moves, or trials of other motions.
+        MetricsError: all points are collinear.
     """
     if len(trials) < 2:
         raise ArmError("one trial alone: the registration is fitted on the first, and others are judged by it")
@@ -176,7 +176,7 @@ def compare(trials: Sequence[Trial]) -> ArmResult:
             "less than 2 s"
         )
     alignment = align(first.tracked, first.truth, delay)
-    # with them the images are of use, too, whose distances fit two orders
+    # with the alignment, images whose distances fit two orders are usable, too
     first = by_places(trials[0], alignment)
     alignment = align(first.tracked, first.truth, find_delay(first.tracked, first.truth))
     trials = [first, *(by_places(trial, alignment) for trial in trials[1:])]
@@ -204,10 +204,10 @@ def compare(trials: Sequence[Trial]) -> ArmResult:
 
 
 def _shift(trial: Trial, first: Trial) -> float:
-    """Seconds by which the motion begins later in a trial's record than in the first one's.
+    """Seconds by which the motion begins later in a trial than in the first trial.
 
     Raises:
-        ArmError: the robot did not move likewise.
+        ArmError: the robot's motions differ.
     """
     begins = []
     for each in (trial, first):
@@ -228,9 +228,9 @@ def _shift(trial: Trial, first: Trial) -> float:
 
 
 def _deviations(trials: Sequence[Trial], placed: Sequence[Trajectory], shifts: Sequence[float]) -> list[FloatArray]:
-    """For each trial (k, 3) metres, the absolute deviations of the end effector from the mean of all trials.
+    """For each trial (k, 3) metres: absolute deviations of the end effector from the mean of all trials.
 
-    Trials are interpolated about the robot's motion, as they are sampled at other times of it.
+    Interpolates the difference to the robot's motion, because trials sample the motion at different times.
     """
     first = max(float(each.times[0]) - shift for each, shift in zip(placed, shifts, strict=True))
     last = min(float(each.times[-1]) - shift for each, shift in zip(placed, shifts, strict=True))

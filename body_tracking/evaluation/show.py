@@ -15,11 +15,11 @@ from body_tracking.evaluation.report import Column, Table, make_folder
 
 
 def summary(angles: AngleSeries, truth: AngleSeries | None = None) -> Table:
-    """A row per angle, degrees.
+    """Table with a row per angle, degrees.
 
     Args:
         angles: estimated.
-        truth: at any stamps within 20 ms of the estimated ones; without it its columns are left out.
+        truth: at any stamps within 20 ms of the estimated ones; None omits its columns.
     """
     known, true = angles.known, true_at(angles, truth)
     final = np.array([next(iter(column[np.isfinite(column)][::-1]), np.nan) for column in known.T])
@@ -50,7 +50,7 @@ def summary(angles: AngleSeries, truth: AngleSeries | None = None) -> Table:
 
 
 def _range(whose: str, values: FloatArray) -> tuple[Column, Column]:
-    """Minimum and maximum of (n, m) angles, without NaN."""
+    """Minimum and maximum of (n, m) angles in degrees, ignoring NaN."""
     known = np.isfinite(values)
     least, most = np.where(known, values, np.inf).min(axis=0), np.where(known, values, -np.inf).max(axis=0)
     least, most = (np.degrees(np.where(known.any(axis=0), each, np.nan)) for each in (least, most))
@@ -59,10 +59,10 @@ def _range(whose: str, values: FloatArray) -> tuple[Column, Column]:
 
 
 def summarise(bag: Path, png: Path | None = None, body: str | None = None, truth: Path | None = None) -> Table:
-    """A summary of every joint angle in a bag; with ``png``, also draws a picture.
+    """Table of all joint angles in a bag; with ``png``, also draws a picture.
 
     Raises:
-        BagError: no such bag, or nothing of it can be read.
+        BagError: no such bag, or it is unreadable.
         EvaluationError: it holds no joint angles, or the picture cannot be written.
     """
     tracked = read(bag, body, truth)

@@ -1,4 +1,4 @@
-"""Fills short gaps in marker trajectories and smooths them, as Schlagenhauf (2017, section 5.6.3)."""
+"""Filling of short gaps in marker trajectories and smoothing, as Schlagenhauf (2017, section 5.6.3)."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from scipy.optimize import minimize_scalar
 from body_tracking.core.skeleton import BoolArray, FloatArray
 
 LONGEST_GAP = 0.2
-"""Seconds from which on a gap is left open (Schlagenhauf 2017, section 5.6.3)."""
+"""Seconds: gaps of this length or longer stay open (Schlagenhauf 2017, section 5.6.3)."""
 
 _LEAST_TO_SMOOTH = 5
 _SMOOTHEST = 8.0
 _ROUGHEST = -4.0
-"""Decades of the smoothing parameter, in sample intervals cubed."""
+"""Search range of the smoothing parameter, as decades in sample intervals cubed."""
 
 
 def fill_gaps(values: FloatArray, rate: float) -> FloatArray:
-    """A trajectory with its gaps shorter than 0.2 s filled by cubic splines (Schlagenhauf 2017, section 5.6.3).
+    """Fill gaps shorter than 0.2 s by cubic splines (Schlagenhauf 2017, section 5.6.3).
 
-    A spline goes through all known samples between two longer gaps. The ends are not extrapolated.
+    A spline passes through all known samples between two longer gaps. The ends are not extrapolated.
 
     Args:
         values: (n, 3), NaN where unknown.
@@ -42,20 +42,20 @@ def fill_gaps(values: FloatArray, rate: float) -> FloatArray:
 
 
 def smooth(values: FloatArray) -> FloatArray:
-    """Every stretch of known samples replaced by its smoothing spline under generalised cross-validation.
+    """Replace every run of known samples by its smoothing spline with generalised cross-validation.
 
-    As Schlagenhauf 2017, section 5.6.3, but for the order of the spline. The cubic spline minimises the squared
-    residuals plus ``lambda`` times the integral of the squared second derivative. One ``lambda`` serves the coordinates
-    of a stretch together and minimises (Craven and Wahba 1979; Woltring, Adv. Eng. Softw. 8, 1986)::
+    As Schlagenhauf 2017, section 5.6.3, except for the spline's order. The cubic spline minimises the squared
+    residuals plus ``lambda`` times the integral of the squared second derivative. One ``lambda`` for all coordinates of
+    a run minimises (Craven and Wahba 1979; Woltring, Adv. Eng. Softw. 8, 1986)::
 
         GCV = mean squared residual / (1 - trace of the influence matrix / n)^2
 
-    It is the spline of ``scipy.interpolate.make_smoothing_spline``, whose search takes seconds for each coordinate of a
-    minute: here the samples are equidistant, so that the residuals come from one banded system (Reinsch 1967) and the
-    trace from the eigenvalues, known in closed form (within 0.5 % from 20 samples on).
+    ``scipy.interpolate.make_smoothing_spline`` gives this spline, but its search takes seconds per coordinate and
+    minute of recording: here the samples are equidistant, so that one banded system gives the residuals (Reinsch 1967)
+    and eigenvalues in closed form the trace (within 0.5 % from 20 samples on).
 
     Args:
-        values: (n, k), equidistant in time, NaN where unknown. Stretches of fewer than 5 samples are left as they are.
+        values: (n, k), equidistant in time, NaN where unknown. Runs of fewer than 5 samples are not smoothed.
     """
     smoothed = values.copy()
     for first, end in runs(np.isfinite(values.sum(axis=1))):
@@ -68,7 +68,7 @@ def _gcv_residual(values: FloatArray) -> FloatArray:
     """(n, k) residuals of the smoothing spline."""
     n = len(values)
     curvature = np.diff(values, 2, axis=0)
-    roughness = np.repeat([[1.0], [-4.0], [6.0]], n - 2, axis=1)  # of Q'Q and R in Reinsch's names
+    roughness = np.repeat([[1.0], [-4.0], [6.0]], n - 2, axis=1)  # Q'Q, and R below, in Reinsch's notation
     spread = np.repeat([[0.0], [1.0 / 6.0], [2.0 / 3.0]], n - 2, axis=1)
     frequency = (np.arange(1, n - 1) + 0.5) * np.pi / n
     eigenvalues = 3.0 * (2.0 - 2.0 * np.cos(frequency)) ** 2 / (2.0 + np.cos(frequency))
@@ -92,6 +92,6 @@ def _gcv_residual(values: FloatArray) -> FloatArray:
 
 
 def runs(flags: BoolArray) -> list[tuple[int, int]]:
-    """(first, end) of every run of true flags; the end is not in it."""
+    """(first, end) of every run of true flags; ``end`` is exclusive."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
     return [(int(first), int(end)) for first, end in edges.reshape(-1, 2)]

@@ -1,4 +1,4 @@
-"""The offset between the clocks of two recordings of one person, by how fast the segments turn in both."""
+"""The clock offset between two recordings of one person, from the angular speeds of the segments."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from body_tracking.evaluation.reading import EvaluationError
 from body_tracking.inertial.clock import clock_offset, turning
 
 STAMPS_AS_THEY_ARE: Final = "the motion does not determine the offset of the clocks; the stamps are taken as they are"
-"""A note."""
+"""Text of a note."""
 _SAME_CLOCK: Final = 1.0
-"""Seconds: half width of the search where the stamps are taken to be of one clock."""
+"""Half width of the search if the stamps are assumed to be of one clock, seconds."""
 _AGREE: Final = 0.1
-"""Seconds by which the offsets of two segments may differ; speeds of skin and bone differ, too."""
+"""Largest difference between the offsets of two segments, seconds; speeds of skin and bone differ."""
 
 
 def start_clock(
     own: Mapping[str, Track], other: Mapping[str, Track], apart: float, sources: str, segments: Mapping[str, str]
 ) -> tuple[ClockModel, list[str]]:
-    """The other recording's clock minus the own one, both counted from their first stamps.
+    """The other recording's clock minus the own one, each counted from its first stamp.
 
     Args:
-        own: orientations by name; instants at which one is unknown are absent.
-        other: the same segments, or targets on them, by the same names.
-        apart: seconds, own first stamp minus the other's, as if both clocks were one.
-        sources: both recordings, for the error.
-        segments: on which segment each is, for the notes.
+        own: orientations by name; unknown instants are left out.
+        other: of the same segments, or of targets on them, by the same names.
+        apart: own first stamp minus the other's, seconds, if both clocks were one.
+        sources: both recordings, for the error message.
+        segments: by name, its segment, for the notes.
 
     Returns:
         The clock, and notes.
 
     Raises:
-        EvaluationError: the angular speed of no segment determines it.
+        EvaluationError: no segment's angular speed determines the offset.
     """
     length, others = (max(float(track.times[-1]) for track in each.values()) for each in (own, other))
     searches = [(0.5 * (others - length), 0.5 * (others + length))]

@@ -1,4 +1,4 @@
-"""Pictures of results, and their comparison with the truth."""
+"""Commands for evaluating results against the truth."""
 
 from __future__ import annotations
 
