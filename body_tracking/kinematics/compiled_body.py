@@ -22,19 +22,19 @@ _SMALL = 1e-8
 
 
 class Tree(NamedTuple):
-    """The tree of segments as arrays of integers; an axis or a direction is a column 0 to 2 times a sign.
+    """The tree of segments as arrays of integers; an axis or a direction is a column of the rotation and a sign.
 
     Attributes:
         parents: (12,).
         coordinates: (12, 2) first coordinate of the tangent that turns a segment, and the one after the last.
-        configuration: (12,) where the configuration has the first angle, or the quaternion.
+        configuration: (12,) index of a segment's first angle, or of its quaternion, in the configuration.
         ball: (12,) 1 where a segment turns freely.
         axes: (32, 2) column and sign of the axis of each coordinate.
         origins: (12,) the point at the origin of each segment.
         points: (12, 2) first point of a segment, and the one after the last, in ``order``.
         order: (19,) points in the order of their segments.
-        parts: (19, 2) first part of the place of a point, and the one after the last.
-        part: (n, 3) length, column and sign of each part.
+        parts: (19, 2) first part of a point's position in its segment, and the one after the last.
+        part: (n, 3) index of the length, column and sign of each part.
     """
 
     parents: IntArray
@@ -130,7 +130,7 @@ def placed(q: FloatArray, lengths: FloatArray, tree: Tree) -> tuple[FloatArray, 
         for number in range(tree.points[segment, 0], tree.points[segment, 1]):
             point = tree.order[number]
             for i in range(3):
-                # the base stands at its own point, which has no parts
+                # the base's frame is at its own point, which has no parts
                 total = q[i] if parent < 0 else positions[tree.origins[segment], i]
                 for k in range(tree.parts[point, 0], tree.parts[point, 1]):
                     total += tree.part[k, 2] * lengths[tree.part[k, 0]] * r[i, tree.part[k, 1]]
@@ -146,7 +146,7 @@ def linearised(
 
     Returns:
         (19, 3) points, (12, 3, 3) rotations, (32, 3) axes, (57, 53) derivative of the points by tangent and lengths,
-        (12, 3, 32) angular velocities of the segments.
+        (12, 3, 32) angular velocities of the segments per tangent velocity.
     """
     positions, rotations, axes = placed(q, lengths, tree)
     observation = np.zeros((3 * len(positions), _NV + _NL))
@@ -187,10 +187,10 @@ def linearised(
 
 @compiled
 def curved(observation: FloatArray, axes: FloatArray, covariance: FloatArray, tree: Tree) -> FloatArray:
-    """(19, 3) half the sum over pairs of coordinates of their covariance and the points' second derivatives.
+    """(19, 3) metres: half the sum over pairs of coordinates of covariance times second derivative of the points.
 
-    The second derivative is the outer axis x (derivative by the inner coordinate); of a ball's two coordinates both
-    orders count by half.
+    The second derivative is the outer axis x (derivative by the inner coordinate); for two coordinates of one ball
+    joint both orders count by half.
     """
     count = len(observation) // 3
     result = np.zeros((count, 3))

@@ -16,11 +16,11 @@ from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV, Ranges
 from body_tracking.kinematics.upper_body import UpperBody
 
 _VERTICAL = 1e-9
-"""Horizontal part of the left-right axis of a pelvis that lies on its side."""
+"""Least horizontal part of the pelvis's left-right axis, for a pelvis that lies on its side."""
 _SMALL, _SERIES = 1e-8, 1e-4
 """Radians below which the first terms of a series are exact."""
 _ANYWHERE = 1e-4
-"""Prior information on the base."""
+"""Prior information on each coordinate of the base, 1/m2 and 1/rad2."""
 _BASE = 6
 """First coordinate of the tangent after the base."""
 
@@ -29,13 +29,13 @@ class PriorTable(NamedTuple):
     """The posture prior and the ranges of motion as arrays.
 
     Attributes:
-        angles_q, angles: (20,) where the configuration, and the 26 coordinates, have the angles.
-        quaternions, rotations: (2,) where they have the shoulders' rotations.
+        angles_q, angles: (20,) indices of the angles in the configuration, and among the 26 coordinates.
+        quaternions, rotations: (2,) first indices of the shoulders' rotations in both.
         to_centre: (2, 4) quaternions from the centre of a shoulder's reach.
         mean: (26,) radians.
         stddev: (29,) of the rows of :func:`prior_rows`.
-        low: (26,) least and
-        high: (26,) greatest values.
+        low: (26,) radians: lower limits.
+        high: (26,) radians: upper limits.
         twist: (26,) coefficients of the sharing of the axial twist.
     """
 
@@ -190,7 +190,7 @@ def normal_equations(
         table: of the prior.
 
     Returns:
-        (32, 32) and (32,) of the step, and the cost at ``q``.
+        (32, 32) matrix and (32,) right-hand side of the step's normal equations, and the cost at ``q``.
     """
     points, rotations, _, observation, turning = linearised(q, lengths, tree)
     values, residuals, rows = prior_rows(q, rotations[0], turning[0], table)
@@ -225,7 +225,7 @@ def normal_equations(
     normal = np.dot(jacobian.T, jacobian) + np.dot(rows.T, rows)
     gradient = np.dot(jacobian.T, error) - np.dot(rows.T, off)
     for k in range(_BASE):
-        normal[k, k] += _ANYWHERE  # with too few points the base still must be somewhere
+        normal[k, k] += _ANYWHERE  # determines the base with too few points
     return normal, gradient.reshape(-1), cost
 
 
@@ -271,7 +271,7 @@ def descended(
 
 
 class CompiledInverse(InverseKinematics):
-    """:class:`InverseKinematics`, a tenth of the time for each step."""
+    """:class:`InverseKinematics` with compiled steps, which take a tenth of the time."""
 
     model: CompiledUpperBody
 

@@ -10,17 +10,17 @@ isb    Wu et al., J. Biomech. 38 (2005) 981, with its signs, left arms mirrored 
        depression. Humerus against thorax Y X Y: plane of elevation (0 abduction, 90 forward flexion), elevation
        (negative), internal rotation; singular hanging and straight up. Forearm against humerus Z X Y: flexion,
        pronation (0 with the palm forward, 90 with the thumb forward). Hand against forearm Z X: flexion, deviation to
-       the ulna. The model has no carrying angle, no clavicle turning about itself and no twist within the wrist.
+       the ulna. The model has no carrying angle, no axial rotation of the clavicle and no twist within the wrist.
 rep155 joints of the REP's kinematic model (package ``human_description``), those of the upper body: ``waist`` leans
        forward; ``r_head``, ``y_head``, ``p_head``; per side ``y_shoulder``, ``p_shoulder``, ``r_shoulder`` (about z, x,
        z: singular hanging and straight up) and ``elbow``. Its trunk has no lateral and no axial bend: head and arms
-       are given against the torso as that model has it, so that they point where the person's do.
+       are given against the torso of that model, so that they point in the person's directions.
 dh26   the 26 angles of Schlagenhauf (2017), tables 3.1 and 3.2; see ``kinematics.dh26``
 ====== ================================================================================================================
 
 Uncertainty is propagated by the analytic Jacobian. Near a singular pose it grows as 1 / sin, up to that of a uniform
-angle, and the angles are held continuous (``kinematics.euler``). It grows up to the same before angles that have left
-their usual ranges, after a path through a singular pose, jump back into them. An unobserved angle has the standard
+angle, and the angles are held continuous (``kinematics.euler``). It also grows up to that limit before angles that have
+left their usual ranges, after a path through a singular pose, jump back into them. An unobserved angle has the standard
 deviation of its prior.
 """
 
@@ -62,7 +62,7 @@ class Chain:
         names: of the three angles; None for an omitted one (always zero in the model, or not in the convention).
         parent, child: segments, or names of :class:`Frame`.
         angles: the sequence.
-        redundant: names of angles that are always zero, because the convention has more than the rotation.
+        redundant: names of angles that are always zero, because the convention has more angles than the rotation.
     """
 
     names: tuple[str | None, str | None, str | None]
@@ -204,7 +204,7 @@ class Convention:
     def _extend(
         self, rotations: FloatArray, turning: FloatArray, values: FloatArray, gradients: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Rotations and their derivatives, with those of the frames appended."""
+        """Rotations (n, 3, 3) and their derivatives (n, 3, 26), with those of the frames appended."""
         sequences, _, _, rows = self.stages[0]
         more_rotations, more_turning = [], []
         for parent, chain, count in self._frames:
@@ -381,7 +381,7 @@ def convention(name: str, model: UpperBody) -> Convention:
     """The convention of a name, for a model.
 
     Raises:
-        ConventionError: there is none of this name.
+        ConventionError: unknown name.
     """
     from body_tracking.kinematics.dh26 import dh26  # imports this module
 

@@ -7,8 +7,8 @@ model differs from ours in three points:
 - Her clavicles have a third angle, theta9 and theta12, about their own axis, which is redundant with the shoulder's
   three angles. It is set to zero; the shoulder's angles are against the clavicle without it.
 - theta16 and theta23, "pronation", turn about the upper arm's axis, as theta15 and theta22 do: redundant, set to zero.
-- Her forearm does not turn about itself. The wrist's two angles are against the forearm without our pronation: they
-  give the direction of the hand, not its rotation about itself.
+- Her forearm has no axial rotation. The wrist's two angles are against the forearm without our pronation: they give the
+  direction of the hand, not its axial rotation.
 
 An angle that is set to zero has an infinite standard deviation, because it is unobservable.
 """

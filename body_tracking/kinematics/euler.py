@@ -5,14 +5,14 @@ other. Every such sequence has a singular pose in which the first and the last a
 (proper Euler angles) where the middle angle is 0 or 180 deg, for three different axes (Cardan angles) where it is 90 or
 -90 deg. There only the sum or the difference of the outer angles is determined.
 
-Both kinds are one: turning a Cardan sequence by a quarter about its second axis makes it an Euler sequence, whose
-middle angle is a quarter turn less. All below is the Euler sequence x y x of ``pre @ R @ post``, with angles
-(a, b, c): ``t1 = a``, ``t2 = b + offset``, ``t3 = sign c``. Its first column, (cos b, sin a sin b, -cos a sin b),
-is the direction of the last axis; its distance ``|sin b|`` from the first one determines the accuracy of a.
+A quarter turn about its second axis makes a Cardan sequence an Euler sequence, whose middle angle is a quarter turn
+less. So the code has only the Euler sequence x y x of ``pre @ R @ post``, with angles (a, b, c): ``t1 = a``,
+``t2 = b + offset``, ``t3 = sign c``. Its first column, (cos b, sin a sin b, -cos a sin b), is the direction of the last
+axis; the distance ``|sin b|`` of this direction from the first axis determines the accuracy of a.
 
 Near the singular pose, where that distance is within the uncertainty of the rotation, the first angle is held at its
-previous value (at 0 where there is none), and the other two are those that come nearest to the rotation; the departure
-is of the size of the rotation's own uncertainty. From :data:`FREE` standard deviations on the angles are exact.
+previous value (at 0 where there is none), and the other two are chosen nearest to the rotation; the departure is of the
+size of the rotation's own uncertainty. From :data:`FREE` standard deviations on the angles are exact.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ WHOLE_MARGIN = np.radians(60.0)
 _SURE = np.radians(20.0)
 """Standard deviation of the rotation about the last axis at which the last angle's range counts half.
 
-The direction that the first two angles are is usually better known: a straight arm that noise has rotated beyond its
-range is not to have its direction reversed.
+The direction given by the first two angles is usually better known: noise that rotates a straight arm beyond its range
+must not reverse its direction.
 """
 
 
@@ -54,11 +54,11 @@ class EulerAngles:
         axes: the three axes, each along an axis of the frame, the second perpendicular to both others.
         usual: degrees, (least, greatest) of the three angles, to choose among equivalent triples.
         turn: (3, 3) ``R @ turn`` is decomposed instead of R. None for the identity.
-        margin: degrees by which the three angles may leave their usual ranges farther, in the sum, than the equivalent
-            triple does, for the sake of continuity, before they jump to that one; from half of it on they are the less
-            certain the nearer the jump is. A continuous path around a singular pose can end in angles such as -180,
-            180, 180 deg for hanging arms: noise decides on which side of the pose an arm passes. Where hanging is the
-            singular pose, an arm that swings back through it needs 60 deg (extension).
+        margin: degrees by which the excess of the three angles over their usual ranges, summed, may be greater than
+            that of the equivalent triple, for continuity, before they jump to that triple; from half of it on their
+            uncertainty grows. A continuous path around a singular pose can end in angles such as -180, 180, 180 deg for
+            hanging arms: noise decides on which side of the pose an arm passes. Where hanging is the singular pose, an
+            arm that swings back through it needs 60 deg (extension).
     """
 
     axes: tuple[FloatArray, FloatArray, FloatArray]
@@ -74,7 +74,7 @@ class Split:
     Attributes:
         angles: (n, 3) radians.
         gradients: (n, 3, 3) of the angles by the angular velocity, in the parent's frame; huge at a singular pose.
-        rates: (n, 3, 3) the same for angles that are held as :attr:`angles` are.
+        rates: (n, 3, 3) the same for the angles as they are held near a singular pose.
         doubt: (n,) from 0 to 1: how near the three angles are to a jump back into their usual ranges.
     """
 
@@ -102,7 +102,7 @@ class EulerSequences:
             sign.append(float(third @ basis[:, 2]) if cardan else along)
         self.basis: FloatArray = np.stack(pre).swapaxes(-1, -2)
         self._pre, self._post = np.stack(pre), np.stack(post)
-        # of a small rotation's three variances the mean of the two that are not about the first axis
+        # weights of a small rotation's three variances: the mean of the two that are not about the first axis
         self._tilt = 0.5 * (1.0 - self._pre[:, 0] ** 2)
         self._offset, self._sign = np.array(offset), np.array(sign)
         usual = np.radians([sequence.usual for sequence in sequences])
@@ -147,7 +147,7 @@ class EulerSequences:
         )
         angles[..., 1] = b + self._offset
         angles[..., 2] = self._sign * c
-        # of a small rotation about the last axis
+        # variance of a small rotation about the last axis
         last = ((self._pre.swapaxes(-1, -2) @ r[:, :, :1])[..., 0] ** 2 * variances).sum(axis=-1)
         chosen, best, beyond = self._choose(angles, previous, _SURE**2 / (_SURE**2 + last))
         derivatives = self._derivatives(np.where(best, parts[:, 0], parts[:, 1]), distance, hold)
@@ -192,7 +192,7 @@ class EulerSequences:
         return excess
 
     def _derivatives(self, parts: FloatArray, distance: FloatArray, hold: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Two (n, 3, 3): angles' rates by the angular velocity in the parent's frame; free, and held.
+        """Derivatives (n, 3, 3) of the free, and of the held, angles by the angular velocity in the parent's frame.
 
         From w = a' x + b' (0, cos a, sin a) + c' (cos b, sin a sin b, -cos a sin b) in the frame of the axes.
         """

@@ -80,7 +80,7 @@ class InverseKinematics:
     def start(self, positions: FloatArray) -> FloatArray:
         """A configuration in closed form, from the directions between the points; no lengths are needed.
 
-        What missing points leave open is neutral.
+        Coordinates that missing points leave undetermined are neutral.
 
         Args:
             positions: (19, 3) metres, in world; NaN where a point is not measured.
@@ -116,7 +116,7 @@ class InverseKinematics:
             q[self._scalar["neck_lateral"]] = -np.arcsin(np.clip(head[1], -1.0, 1.0))
         for side, sign in (("left", 1.0), ("right", -1.0)):
             self._start_arm(q, point, upper_trunk, top, side, sign)
-        # a damaged or far-fetched direction must not start outside of what a body can do
+        # an implausible direction must not lead to a start outside the ranges of motion
         scalar = self.model.scalar_q
         rows = self.model.scalar_v - 6
         q[scalar] = np.clip(q[scalar], self.ranges.low[rows], self.ranges.high[rows])
@@ -139,11 +139,10 @@ class InverseKinematics:
             positions: (19, 3) metres, in world; NaN where a point is not measured.
             stddev: (19,) metres, of each point, the same in all directions.
             lengths: (21,) metres.
-            q: (35,) where to start; the closed form where None.
-            max_iterations: at most so many steps.
+            q: (35,) start; that of the closed form if None.
+            max_iterations: greatest number of steps.
             tolerance: of the last step's tangent, radians and metres.
-            alternatives: whether to look at arms turned about themselves, too, and take the best; where no start is
-                given, if None.
+            alternatives: whether to try axially rotated arms, too, and take the best; None: only without a start.
 
         Raises:
             ModelError: no trunk is seen, and no start was given.
@@ -170,7 +169,7 @@ class InverseKinematics:
         return Fit(q, covariance, residuals, cost)
 
     def cost(self, q: FloatArray, positions: FloatArray, stddev: FloatArray, lengths: FloatArray) -> FloatArray:
-        """(...,) what :attr:`Fit.cost` would be at configurations (..., 35); other arguments as of :meth:`solve`."""
+        """(...,) :attr:`Fit.cost` at configurations (..., 35); other arguments as of :meth:`solve`."""
         measured = np.isfinite(positions).all(axis=1) & np.isfinite(stddev)
         weights = np.where(measured, 1.0 / np.where(measured, stddev, 1.0), 0.0)
         target = np.where(measured[:, None], positions, 0.0)
@@ -183,11 +182,11 @@ class InverseKinematics:
     def turned_about(
         self, q: FloatArray, positions: FloatArray, stddev: FloatArray, lengths: FloatArray
     ) -> list[FloatArray]:
-        """Where to look for other poses of either arm: the best one with the hand turned about itself, each.
+        """Starts for other poses of each arm: the best configuration with the hand rotated about its own axis.
 
-        The forearm is turned through its whole range, and the wrist is bent so that the hand points where it did. Where
-        the elbow is nearly straight, the upper arm is turned about itself besides, and the elbow bent to where the
-        forearm points.
+        The forearm is rotated through its whole range, and the wrist is bent to keep the direction of the hand. Where
+        the elbow is nearly straight, the upper arm is rotated about its own axis as well, and the elbow bent to keep
+        the direction of the forearm.
 
         Args:
             q: (35,) a pose.
@@ -211,7 +210,7 @@ class InverseKinematics:
         return found
 
     def is_turned(self, q: FloatArray, other: FloatArray) -> BoolArray:
-        """(...,) whether configurations ``other`` (..., 35) hold a hand turned about itself against ``q`` (35,)."""
+        """(...,) whether a hand of configurations (..., 35) is rotated about its own axis against ``q`` (35,)."""
         lengths = self.model.default_lengths()
         here, there = (
             self.model.forward(each, lengths).rotations.take(self._hands, axis=-3)[..., 0] for each in (q, other)
@@ -220,7 +219,7 @@ class InverseKinematics:
         return result
 
     def _all_round(self, q: FloatArray, side: str) -> FloatArray:
-        """(n, 35) a configuration with one arm turned all the way round, its hand pointing where it does."""
+        """(n, 35) a configuration with one arm rotated about its axis by many angles, the hand's direction kept."""
         sign = 1.0 if side == "left" else -1.0
         elbow, pronation, flexion, deviation = (
             self._scalar[f"{name}_{side}"]
@@ -274,7 +273,7 @@ class InverseKinematics:
         return q, normal, cost
 
     def _costs(self, size: FloatArray, soft: FloatArray, tilt: FloatArray) -> FloatArray:
-        """(...,) of normalised residuals (..., 19), the quantities (..., 26) of ranges and the tilt (..., 2)."""
+        """(...,) costs by normalised residuals (..., 19), values of the ranges (..., 26) and the tilt (..., 2)."""
         points = np.where(size <= HUBER, 0.5 * size**2, HUBER * (size - 0.5 * HUBER)).sum(axis=-1)
         off = (soft - self.prior.mean) / self.prior.stddev
         leans = tilt / self.prior.tilt_stddev
@@ -312,12 +311,12 @@ class InverseKinematics:
         upright = tilt.gradients / self.prior.tilt_stddev[:, None]
         normal += upright.T @ upright
         gradient -= upright.T @ (tilt.values / self.prior.tilt_stddev)
-        # the base is anywhere; with too few points it still must be somewhere
+        # a weak prior determines the base with too few points
         normal[np.arange(6), np.arange(6)] += 1e-4
         return normal, gradient, float(self._costs(size, soft.values, tilt.values))
 
     def _set_trunk(self, q: FloatArray, part: str, rotation: FloatArray) -> None:
-        """Flexion, lateral and axial angle of an intrinsic y-x-z rotation."""
+        """Set flexion, lateral and axial angle from an intrinsic y-x-z rotation (3, 3)."""
         q[self._scalar[f"{part}_flexion"]] = np.arctan2(rotation[0, 2], rotation[2, 2])
         q[self._scalar[f"{part}_lateral"]] = -np.arcsin(np.clip(rotation[1, 2], -1.0, 1.0))
         q[self._scalar[f"{part}_axial"]] = np.arctan2(rotation[1, 0], rotation[1, 1])
@@ -331,7 +330,7 @@ class InverseKinematics:
         side: str,
         sign: float,
     ) -> None:
-        """From the clavicle to the wrist, as far as points are seen."""
+        """Set the angles from the clavicle to the wrist, as far as points are seen."""
         shoulder, elbow, wrist, hand, tip, thumb = (
             point[Joint[f"{name}_{side.upper()}"]]
             for name in ("SHOULDER", "ELBOW", "WRIST", "HAND", "HAND_TIP", "THUMB")
@@ -347,7 +346,7 @@ class InverseKinematics:
         z = -_unit(upper)
         forearm = _unit(wrist - elbow)
         x = forearm + z * float(-forearm @ z)
-        # without a bent elbow the arm is turned as by the shortest way from where the reach has its centre
+        # a straight arm has the axial rotation of the shortest rotation from the centre of the reach
         if not np.sqrt(x @ x) > _STRAIGHT:
             reach = np.array([np.sqrt(0.5), sign * np.sqrt(0.5), 0.0])
             hanging = np.array([0.0, 0.0, -1.0])
@@ -377,7 +376,7 @@ class InverseKinematics:
 
 
 def _sizes(residuals: FloatArray) -> FloatArray:
-    """(...) of vectors (..., 3)."""
+    """(...,) norms of vectors (..., 3)."""
     result: FloatArray = np.sqrt((residuals * residuals).sum(axis=-1))
     return result
 

@@ -10,7 +10,7 @@ LIMBS: Final = ("left arm", "right arm", "trunk and head", "left leg", "right le
 """The limbs, in the order in which they are listed; angles of other names are in :data:`OTHER`."""
 UNKNOWN: Final = 30.0
 """Standard deviation of an angle, degrees, from which it counts as unknown: the 95 % band is 60 degrees to each side,
-as wide as what limits and habits of people alone say of most angles. Chosen on the shipped recordings."""
+as wide as that of the priors of most angles. Chosen on the shipped recordings."""
 OTHER: Final = "other angles"
 
 _SIDES: Final = {"l": "left", "r": "right"}

@@ -244,7 +244,7 @@ class SegmentLengths:
         slow: float = 0.0,
         stretch: float = 0.0,
     ) -> SegmentLengths:
-        """With one more frame; ``blocks`` is a new object whenever a block is complete. Arrays are kept, not copied.
+        """A copy with one more frame; ``blocks`` is a new object whenever a block is complete. Arrays are not copied.
 
         Args:
             sensor: name of the sensor.
@@ -269,7 +269,7 @@ class SegmentLengths:
     def with_unfinished_block(
         self, sensor: str, white: FloatArray, slow: float = 0.0, stretch: float = 0.0
     ) -> SegmentLengths:
-        """With the frames of a sensor's unfinished block as one more block; arguments as of :meth:`with_frame`."""
+        """A copy with a sensor's unfinished block as one more block; arguments as of :meth:`with_frame`."""
         frames = self._gathered.get(sensor, ())
         if not frames:
             return self
@@ -320,9 +320,9 @@ class SegmentLengths:
 class SkeletonLengths:
     """The lengths of one person by filtered skeletons, from the first frame on.
 
-    Until the first block is complete, the frames so far are one. The lengths follow the estimate gradually, because a
-    block can change one by centimetres, and a pose that is fitted with it by degrees. Points count as free of white
-    noise, which the filter has removed, and of slow errors, so that measurements outweigh the prior.
+    Until the first block is complete, the frames so far count as one block. The lengths follow the estimate gradually,
+    because a block can change a length by centimetres, and the pose fitted with it by degrees. Points count as free of
+    white noise, which the filter has removed, and of slow errors, so that measurements outweigh the prior.
 
     Attributes:
         lengths: (21,) metres; unseen ones are the other side's, or in proportion to the others.
@@ -395,7 +395,7 @@ def _block(frames: tuple[_Frame, ...], white: FloatArray, slow: float, stretch: 
 
 
 def _nanmean(values: FloatArray) -> FloatArray:
-    """Over the first dimension; NaN, without a warning, for fewer than two values."""
+    """Mean over the first dimension; NaN, without a warning, for fewer than two values."""
     there = np.isfinite(values)
     count = there.sum(axis=0)
     total = np.where(there, values, 0.0).sum(axis=0)
@@ -403,7 +403,7 @@ def _nanmean(values: FloatArray) -> FloatArray:
 
 
 def _nanmedian(values: FloatArray) -> FloatArray:
-    """Over the first dimension; NaN, without a warning, where there is no value."""
+    """Median over the first dimension; NaN, without a warning, where there is no value."""
     ordered = np.sort(values, axis=0)  # NaN comes last
     count = np.isfinite(values).sum(axis=0)
     columns = np.arange(values.shape[1])

@@ -163,7 +163,7 @@ _DENSITIES_SQUARED = 3.0 * joint_densities()[_JOINTS, None] ** 2
 
 _EYE3 = np.eye(3)
 _TINY = 1e-18
-"""Square metres below which a squared length is none."""
+"""Square metres: a smaller squared length counts as zero."""
 _YZX, _ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
 _SINGULAR = 1e-6
 """Sine below which a vector lies along the axis that it should turn about."""
@@ -243,7 +243,7 @@ def _dihedral(
 
 @lru_cache
 def _correlation(of_bones: float) -> FloatArray:
-    """(joints, joints) of the used ones."""
+    """(joints, joints) correlation of the errors of the used joints."""
     return joint_correlation(of_bones)[np.ix_(_JOINTS, _JOINTS)]
 
 
@@ -345,7 +345,7 @@ def _angles_and_jacobian(positions: FloatArray) -> tuple[FloatArray, FloatArray,
     )
     smaller = np.minimum(area_p / squares[_D_P], area_q / squares[_D_Q]) / squares[_D_AXIS]
     dihedral = np.where(_D_TURNED, np.arctan2(-x, y), np.arctan2(y, x))  # a quarter turn back
-    # NaN of a vector without length gets into the angles, which would be some number otherwise
+    # propagate the NaN of a vector without length to its angles, which would be finite otherwise
     angles = np.concatenate([_B_SIGN * between + _B_OFFSET + 0.0 * sine, dihedral + 0.0 * smaller])
 
     gradient *= _B_SIGN

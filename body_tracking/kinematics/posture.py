@@ -45,7 +45,7 @@ TILT_STDDEV = (10.0, 6.0)
 """Degrees: tilt of the pelvis against gravity, forward and sideways."""
 
 _VERTICAL = 1e-9
-"""Horizontal part of the left-right axis of a pelvis that lies on its side."""
+"""Least horizontal part of the pelvis's left-right axis, for a pelvis that lies on its side."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

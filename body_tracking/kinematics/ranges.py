@@ -138,7 +138,7 @@ class Ranges:
         return SoftCoordinates(values, self.gradients(values))
 
     def gradients(self, values: FloatArray) -> FloatArray:
-        """Those of :class:`SoftCoordinates`, of its values (..., 26)."""
+        """(..., 26, 26) gradients of :class:`SoftCoordinates`, from its values (..., 26)."""
         turned = values[..., self._soft]
         gradients = np.zeros((*values.shape, len(self.low)))
         gradients[...] = np.eye(len(self.low))
@@ -148,7 +148,7 @@ class Ranges:
         return gradients
 
     def values(self, q: FloatArray) -> FloatArray:
-        """Those of :class:`SoftCoordinates` alone."""
+        """(..., 26) values of :class:`SoftCoordinates` at configurations (..., nq)."""
         values = np.empty((*q.shape[:-1], len(self.low)))
         values[..., self._scalar_soft] = q[..., self._model.scalar_q]
         values[..., self._soft] = so3.log(so3.quat_multiply(self.to_centre, q[..., self._quaternions]))
@@ -162,7 +162,7 @@ class Ranges:
         return self.excess_of(self.values(q))
 
     def excess_of(self, values: FloatArray) -> FloatArray:
-        """The same of the values (..., 26) of :class:`SoftCoordinates`."""
+        """As :meth:`excess`, from the values (..., 26) of :class:`SoftCoordinates`."""
         excess = np.maximum(values - self.high, 0.0) + np.minimum(values - self.low, 0.0)
         for rows in self._soft:
             swing = values[..., rows[:2]]

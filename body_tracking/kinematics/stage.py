@@ -111,7 +111,7 @@ class AnglesStage(Stage):
 
     @property
     def convention(self) -> str:
-        """Of the angles that are published."""
+        """The convention of the published angles."""
         return next(iter(self.streams.values())).convention
 
     def change(self, values: Mapping[str, Value]) -> None:

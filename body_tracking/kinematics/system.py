@@ -1,4 +1,4 @@
-"""The joint angles."""
+"""The kinematics system: the node of the joint angles, its options and topics."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
     from body_tracking.pipeline.roles import role_of
 
     role = role_of(options)
-    # Options that were not given are left to joint_angles, which follows the filter while that changes.
+    # Options that were not given are left to joint_angles, which follows a change of the filter.
     angles: dict[str, Value] = asked(options, input="angles_input", subject="subject", people="people")
     if options["convention"] not in ("", graph.AUTO) or graph.convention_of(role.angles_input) != role.convention:
         angles["convention"] = role.convention
-    # A Kinect displaces neighbouring joints alike, and so does the fit of a mesh (correlation 0.6 to 0.9 in simulated
-    # people); a camera's landmarks err one by one.
+    # The errors of neighbouring joints of a Kinect, or of the fit of a mesh, are correlated (0.6 to 0.9 in simulated
+    # people); those of a camera's landmarks are independent.
     cameras_alone = bool(options["computed"]) and options["sensors"] == options["computed"] and not options["depth"]
     defaults: dict[str, Value] = {"bone_correlation": 0.0} if cameras_alone else {}
     yield NodeSpec("joint_angles", "joint_angles", defaults=defaults, parameters={**transport(options), **angles})

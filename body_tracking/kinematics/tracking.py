@@ -226,7 +226,7 @@ class AngleStream:
         self._previous = None
 
     def of_skeleton(self, skeleton: Skeleton) -> JointAngles | None:
-        """Of one frame; None where the convention needs a model and no trunk is seen."""
+        """The angles of one frame; None if the convention needs a model and no trunk is seen."""
         self._reset_after_gap(skeleton.stamp_ns)
         if self.convention == POSITIONAL:
             self._previous = positional_angles(skeleton, self._of_bones)
@@ -235,10 +235,10 @@ class AngleStream:
         return None if estimate is None else self.of_estimate(estimate)
 
     def of_estimate(self, estimate: ModelEstimate) -> JointAngles:
-        """Of one state of the model.
+        """The angles of one state of the model.
 
         Raises:
-            ConventionError: the convention is made of positions.
+            ConventionError: the convention is :data:`POSITIONAL`.
         """
         self._reset_after_gap(estimate.stamp_ns)
         angles = angles_of(estimate, self.model, self.convention, self._previous)

@@ -37,9 +37,9 @@ def eased(time: FloatArray, way: float, ramp: float) -> FloatArray:
 
 
 class Moves:
-    """Minimum-jerk moves one after the other, with rests between; always between two of its targets.
+    """Successive minimum-jerk moves from target to target, with rests between.
 
-    ``half`` (d,) makes radians of its shares, ``rate`` is the greatest of its moves in radians per second.
+    ``half`` (d,) is the factor from positions to radians, ``rate`` the greatest rate of the moves in rad/s.
     """
 
     def __init__(self, start: FloatArray, half: FloatArray | float = 1.0, rate: float = 1.0) -> None:
@@ -50,12 +50,12 @@ class Moves:
 
     @property
     def target(self) -> FloatArray:
-        """Where it is after the last move."""
+        """(d,) the position after the last move."""
         return self._targets[-1]
 
     @property
     def end(self) -> float:
-        """When the last move ends."""
+        """Seconds: the end of the last move; minus infinity without moves."""
         return self._begins[-1] + self._durations[-1] if self._begins else -np.inf
 
     def move(self, begin: float, duration: float, target: FloatArray) -> None:

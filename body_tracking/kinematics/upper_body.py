@@ -16,8 +16,8 @@ wrist                  flexion (towards the palm), deviation (towards the thumb)
 The lumbar joint lies at SpineBase, the thoracic one at SpineMid, both clavicles at SpineShoulder, the neck at Neck.
 With all 19 points seen, two directions of the tangent space move none of them: turning the lower trunk about its own
 axis and the upper trunk back, and turning the upper trunk about its axis while both shoulders keep their place (one
-clavicle protracts, the other retracts). They touch four angles, :data:`UNOBSERVED`; where the trunk is bent, a little
-of its other angles too. A straight elbow adds the humerus turning against pronation on that side.
+clavicle protracts, the other retracts). They involve four angles, :data:`UNOBSERVED`, and for a bent trunk, a little,
+its other angles. A straight elbow adds the axial rotation of the humerus against pronation on that side.
 ``test_upper_body.py`` computes all of this.
 """
 
@@ -204,7 +204,7 @@ class UpperBody:
         self.scalar_v: IntArray = np.array(v_scalar, dtype=np.intp)
         self._quat_q: IntArray = (np.array(q_ball)[:, None] + np.arange(4)).astype(np.intp)
         self.ball_v: IntArray = (np.array(v_ball)[:, None] + np.arange(3)).astype(np.intp)
-        # what of the tangent is simply added to the configuration
+        # coordinates of the tangent that are simply added to the configuration
         self._added = np.zeros((self.nv, self.nq))
         self._added[:3, :3] = _EYE3
         self._added[self.scalar_v, self.scalar_q] = 1.0
@@ -252,14 +252,14 @@ class UpperBody:
         ]
         self._centre_segment: IntArray = np.array(carrier, dtype=np.intp)
         self._centre_point = self._origin_point[self._centre_segment]
-        # of each pair of coordinates the second derivative has the earlier axis outside; of a ball's both by half
+        # weights of second derivatives: the earlier axis is the outer one; in a ball joint both orders count by half
         same = self._centre_segment[:, None] == self._centre_segment
         ball = same & np.isin(self._centre_segment, ball_segments)
         later = np.triu(np.ones((self.nv - 3, self.nv - 3)), 1)
         self._pairs = np.where(ball, 0.5, later) * (1.0 - np.eye(self.nv - 3)) + 0.5 * np.eye(self.nv - 3)
 
     def _place_directions(self, scalar_segments: list[int], ball_segments: list[int]) -> None:
-        """Where the axis of each rotational coordinate is a column, or its opposite, of a rotation in world.
+        """Find the rotation in world of which a column, or its opposite, is the axis of a rotational coordinate.
 
         The last axis of a joint stands still in the segment that it turns, the first one in the parent. The middle one
         of three stands still in a frame of its own, which comes after the segments.
@@ -286,7 +286,7 @@ class UpperBody:
         self._axis_columns = _columns([frame[v] for v in range(3, self.nv)])
 
     def _place_lengths(self, segment_of: list[int]) -> None:
-        """Along which column of which segment each length extends, and in the places of which points it counts."""
+        """Find the column of a segment's rotation along which each length extends, and the points that it displaces."""
         carried: dict[str, tuple[int, FloatArray]] = {}
         self._counts = np.zeros((len(POINTS), len(LENGTHS)))
         for point, (_, _, parts) in enumerate(POINTS):
@@ -436,7 +436,7 @@ class UpperBody:
 
 
 def _rotations(start: int, stop: int) -> tuple[Any, ...]:
-    """The index of some of a stack of rotations (..., n, 3, 3)."""
+    """The index of a range of a stack of rotations (..., n, 3, 3)."""
     return (..., slice(start, stop), slice(None), slice(None))
 
 
