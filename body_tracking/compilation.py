@@ -23,7 +23,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     """The subcommand: each system in a process of its own, since numba compiles one function at a time.
 
-    They are forked: a new interpreter would run the script again that an install has made of this command.
+    The processes are forked: a new interpreter would run the console script of this command again.
     """
     functions = {system.name: system.prepare for system in SYSTEMS if system.prepare}
     with ProcessPoolExecutor(mp_context=multiprocessing.get_context("fork")) as pool:

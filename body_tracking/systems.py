@@ -96,7 +96,7 @@ def options_of(**given: Value) -> Options:
         others = given.get("sensors", ())
         found |= {"computed": computed, "sensors": (*(others if isinstance(others, tuple) else ()), *computed)}
     if found["imus"] and not found["sensors"] and not found["filter"]:
-        found["filter"] = "ekf"  # the one that takes orientations without skeletons
+        found["filter"] = "ekf"  # the only filter that works with orientations alone
     return found
 
 
