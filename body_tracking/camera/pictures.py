@@ -52,7 +52,7 @@ class Pictures:
 
     Args:
         camera: its name.
-        rate: at most so many a second; 0 for none.
+        rate: greatest number of pictures per second; 0 for none.
         wanted: whether a topic has a subscriber.
 
     Attributes:
@@ -98,7 +98,7 @@ def draw(image: NDArray[np.uint8], found: Landmarks) -> None:
 
 
 def drawn_in(image: ImageArray, people: Iterable[Landmarks], width: int) -> ImageArray:
-    """A copy of an image (height, width, 3), at most so many pixels wide, with the people drawn in."""
+    """A copy of an image (height, width, 3), at most ``width`` pixels wide, with the people drawn in."""
     picture = np.ascontiguousarray(image).copy()
     for each in people:
         draw(picture, each)

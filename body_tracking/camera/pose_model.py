@@ -44,7 +44,7 @@ ImageArray = NDArray[np.uint8]
 
 
 class PoseModelError(BodyTrackingError):
-    """Raised when a file of the networks is missing or invalid, or the library that runs them is not installed."""
+    """Raised when the networks cannot be fetched or read, or the library that runs them is not installed."""
 
 
 class Landmark(IntEnum):

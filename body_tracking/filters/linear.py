@@ -495,7 +495,7 @@ class LinearKalmanFilter(JointSmoother):
         return Skeleton(stamp_ns, frame_id, positions, states, body, covariances, velocities)
 
     def _systematic(self) -> FloatArray:
-        """(25, 3, 3) square metres: covariance of what no filter removes, slow errors and the last jump."""
+        """(25, 3, 3) square metres: covariance of the errors that no filter removes, slow ones and the last jump."""
         return self._slow + self._jumped[:, :, None] * self._jumped[:, None, :]
 
     def last_frame(self, filtered: Skeleton) -> JointFrame:

@@ -55,8 +55,8 @@ class FilterSettings:
         parameters: of the filter, without a prefix.
         input: ``graph.AUTO``, ``graph.FUSED_INPUT`` or ``graph.SENSORS_INPUT``.
         sensors: for ``graph.SENSORS_INPUT``.
-        reference: for the same: sensor with the clock of ``world``; empty for the first one.
-        world: for the same: frame of the output.
+        reference: for the same input: sensor with the clock of ``world``; empty for the first one.
+        world: for the same input: frame of the output.
         body: the person's id in topics.
         predict_after: seconds without a frame after which predicted ones are published.
         order_wait: greatest time in seconds that a sensor's frame waits for an older one.

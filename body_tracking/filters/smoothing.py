@@ -24,7 +24,7 @@ _SILENCE = 0.1
 
 
 class Frame(Protocol):
-    """The estimate after one frame, with what a backward pass needs."""
+    """The estimate after one frame, with the data for a backward pass."""
 
     @property
     def stamp_ns(self) -> int: ...

@@ -244,7 +244,7 @@ def descended(
 ) -> tuple[FloatArray, FloatArray, float]:
     """(35,) the nearest minimum (Levenberg and Marquardt), (32, 32) the normal equations and the cost there.
 
-    Arguments as of :func:`normal_equations`; at most so many iterations, until no coordinate of a step reaches the
+    Arguments as of :func:`normal_equations`; it ends after ``iterations``, or when no coordinate of a step reaches the
     tolerance.
     """
     damping = 1e-3

@@ -27,11 +27,11 @@ from body_tracking.kinematics.upper_body import UpperBody
 _J = Joint
 _TINY = 1e-9
 _STRAIGHT = 0.15
-"""Sine of the elbow's flexion below which the forearm does not determine the upper arm's rotation about itself."""
+"""Sine of the elbow's flexion below which the forearm does not determine the upper arm's axial rotation."""
 LIMIT_STDDEV = np.radians(4.0)
 """Standard deviation of the soft limits of the ranges of motion."""
 _TURNED = np.radians(60.0)
-"""Rotation of a hand about itself from which two fits are different minima, which are half a turn apart."""
+"""Radians: axial rotation of a hand beyond which two fits are different minima, which are half a turn apart."""
 _NEARLY_STRAIGHT = 0.5
 """Sine of the elbow's flexion up to which rotations of the upper arm are searched, too: beyond, an eighth of a turn
 moves the wrist of a forearm of 0.25 m by 0.09 m, more than any sensor's noise."""

@@ -48,7 +48,7 @@ _MIN_LENGTH = 0.005
 _STATURE_SHARE, _PROPORTION_SHARE, _SIDE_SHARE = 0.04, 0.08, 0.02
 """Relative standard deviations of lengths between people: common to all, per kind, per side."""
 _MIN_SCALE = 0.08
-"""Metres: shorter lengths have the standard deviation of this one, because of how sensors place their points."""
+"""Metres: shorter lengths have the standard deviation of this length, because sensors displace their points."""
 _MIN_SIZE, _MAX_SIZE = 0.5, 1.4
 """Bounds of a person's size relative to the average."""
 

@@ -42,7 +42,7 @@ RANGES: dict[str, tuple[float, float]] = {
 SHOULDER_SWING = 130.0
 """Degrees: largest angle between an upper arm and the centre of its reach."""
 SHOULDER_TWIST = 110.0
-"""Degrees: largest rotation of an upper arm about itself, against the shortest rotation from the centre."""
+"""Degrees: largest axial rotation of an upper arm, against the shortest rotation from the centre."""
 RANGE_DEVIATIONS = 3.0
 """Standard deviations from the centre of a range to its limits."""
 TWIST_SHARING_STDDEV = 30.0
@@ -187,10 +187,10 @@ class Ranges:
         return clipped
 
     def nearest_branch(self, q: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-        """The same posture by angles that leave the ranges less.
+        """An equivalent configuration whose angles leave the ranges less.
 
-        An upper arm turned by half a turn about itself, the elbow bent the other way and the forearm turned by half a
-        turn are the same posture. A fit to points can converge to either branch; the ranges distinguish them.
+        Half a turn of the upper arm about its axis, the elbow bent the other way and half a turn of the forearm leave
+        the posture unchanged. A fit to points can converge to either branch; the ranges distinguish them.
 
         Args:
             q: (nq,) one configuration.

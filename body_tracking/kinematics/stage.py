@@ -154,7 +154,7 @@ class AnglesStage(Stage):
         return graph.model_topics(next(iter(self.streams)), self._several).covariance
 
     def look(self, published: Callable[[str], bool]) -> bool:
-        """Subscribe to what the filter publishes, once two checks agree: topics are discovered one by one.
+        """Subscribe to the topics that the filter publishes, once two checks agree: topics are discovered one by one.
 
         Nothing changes while there is no filter, as during its restart.
         """

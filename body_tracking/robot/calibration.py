@@ -20,7 +20,7 @@ class CalibrationQuality:
     Attributes:
         missing: sensors without a pose.
         rotation_stddev: radians, of the least certain sensor; NaN where it is not reported.
-        translation_stddev: metres, likewise.
+        translation_stddev: metres, of the least certain sensor; NaN where it is not reported.
     """
 
     missing: tuple[str, ...]

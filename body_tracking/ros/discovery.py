@@ -40,7 +40,7 @@ class Domain:
 
 
 class Watch:
-    """Discovers what is in the ROS domain until it is closed; the first nodes appear after a second or so.
+    """Discovers nodes and topics of the ROS domain until it is closed; the first ones appear after a second or so.
 
     Args:
         namespace: in which sensors are looked for.

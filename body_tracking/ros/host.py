@@ -136,13 +136,13 @@ class StageNode(GraphNode):
             self.poll()
 
     def batch_done(self) -> None:
-        """Publish what is due after a batch of messages; called by the executor."""
+        """Publish the outputs that are due after a batch of messages; called by the executor."""
         self.poll()
         self.stage.settle()
         self.sent_ns = None
 
     def poll(self) -> None:
-        """Publish what is due, and set the alarm for the next deadline."""
+        """Publish the outputs that are due, and set the alarm for the next deadline."""
         try:
             self.publish(self.stage.poll(self.waiting_ns()))
         except BodyTrackingError as error:

@@ -21,7 +21,7 @@ class Displacement:
 
     Args:
         space: of the states.
-        centres: what is known of the joints' centres.
+        centres: estimator of the offsets of the joint centres.
         parameters: of the filter.
     """
 

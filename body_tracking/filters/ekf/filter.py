@@ -112,7 +112,7 @@ class ExtendedKalmanFilter:
         self._smoother = Smoother(space, self._motion)
         self.reset()
 
-    # --- what users call
+    # --- interface
 
     def reset(self) -> None:
         """Forget the person; the counters stay."""

@@ -27,7 +27,7 @@ _HARD_STDDEV = 0.2
 """Degrees: the same far beyond a limit."""
 _PROJECTIONS = 3
 _FAR_BEYOND, _BACK_TO = np.radians(10.0), np.radians(8.0)
-"""An estimate farther beyond a range than the first is brought back to the second."""
+"""Radians: an estimate farther beyond a range than ``_FAR_BEYOND`` is brought back to ``_BACK_TO`` beyond it."""
 _HELD_STDDEV = 0.002
 """Radians: standard deviation by which priors may rotate a segment with a measured orientation."""
 _HELD_FOR_NS = NANOSECONDS // 4
@@ -187,7 +187,7 @@ class Priors:
             observation: (k, 32) observation matrix.
             error: (k,) innovation.
             noise: (k,) variances.
-            part: of the covariance, and of that with the slow errors of cameras, what may be corrected.
+            part: the parts that may be corrected, of the covariance and of that with the slow errors of cameras.
 
         Raises:
             LinAlgError: the innovation covariance is not positive definite.

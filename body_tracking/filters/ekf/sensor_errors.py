@@ -196,7 +196,7 @@ class SensorErrors:
 
 
 def _kept(before: float, after: float) -> float:
-    """The new scale of slow errors, or the one before where they hardly differ."""
+    """The new scale of slow errors, or the old one if they hardly differ."""
     return before if abs(before - after) <= _SLOW_STEP * after else after
 
 

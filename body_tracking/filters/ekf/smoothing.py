@@ -10,7 +10,7 @@ prediction):
 
     G = N F^T (N-')^-1,    N_s = N + G (N_s' - N-') G^T,    P_s = P + N_s - N.                                (2)
 
-The tangent spaces at the prediction and at the smoothed configuration are taken for the same, as both are only degrees
+The tangent spaces at the prediction and at the smoothed configuration are not distinguished: both are only degrees
 apart.
 """
 
@@ -85,7 +85,7 @@ class Smoother:
         return Frame(state, skeleton, epoch, free, free)
 
     def _own(self, state: State) -> IntArray:
-        """(n,) indices of what is smoothed: pose and velocities, and lengths while they are estimated."""
+        """(n,) indices of the smoothed states: pose and velocities, and lengths while they are estimated."""
         return self._pose if state.settled else self._all
 
     def free(self, state: State) -> FloatArray:

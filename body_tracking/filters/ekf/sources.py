@@ -219,7 +219,7 @@ class Sources:
 
         If it grows from a to b, the error is a random walk: b - a is added. If it shrinks, the source has corrected
         itself: of an error e of variance a, (b / a) e is left, and a new one of variance b (1 - b / a) is added: the
-        regression of an optimal estimate's error on the one before.
+        regression of an optimal estimate's error on its earlier error.
 
         Returns:
             The sources, (4,) factors on the errors of misalignment and heading, and (4,) rad2 that are added to their

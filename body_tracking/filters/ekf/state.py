@@ -65,7 +65,7 @@ class SensorState(Changeable):
         positions: (k, 19, 3) their points, NaN where not used.
         white: (19,) variance of the white noise per axis, square metres.
         differences: (19,) mean of the squared differences of each point alone.
-        weight: (19,) how many of these there were.
+        weight: (19,) number of squared differences in this mean.
         slow: scale of the slow variance of points.
         slow_estimate: running estimate of this scale, used only if significant.
         slow_information: of the running estimate.
