@@ -56,14 +56,14 @@ class Displacement:
         if state.sources.names:
             weights = np.where(space.thumbs[state.sources.segments].any(axis=0), 0.0, weights)
         if self._centres.offsets is not None:
-            spread = scale**2 * self._left(state, lines)
+            spread = scale**2 * self._remaining(state, lines)
         else:
             deviations = offsets.repeat(_DIMENSIONS)
             spread = self._correlation * deviations * deviations[:, None]
         gain = displacing(lines.observation, weights, self._prior_information)
         return gain @ spread @ gain.T, gain @ state.disputed
 
-    def _left(self, state: State, lines: Linearised) -> FloatArray:
+    def _remaining(self, state: State, lines: Linearised) -> FloatArray:
         """(57, 57) square metres: covariance of the points' offsets that remain after a T-pose."""
         positions = np.full((N_JOINTS, _DIMENSIONS), np.nan)
         positions[self._space.model.joints] = lines.posture.positions

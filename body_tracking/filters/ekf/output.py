@@ -57,7 +57,7 @@ class Output:
             offsets, disputed = self._displacement.displaced(state)
             covariance[pose, pose] += offsets
             if state.sources.names:
-                q = self._middled(q, state.covariance[space.tangent, space.tangent])
+                q = self._centred(q, state.covariance[space.tangent, space.tangent])
             if self._parameters.posture:
                 free, _ = self._priors.free(state, covariance, np.empty((space.size, 0), dtype=np.float32))
                 held = covariance - free
@@ -80,7 +80,7 @@ class Output:
             _UPDATES,
         )
 
-    def _middled(self, q: FloatArray, covariance: FloatArray) -> FloatArray:
+    def _centred(self, q: FloatArray, covariance: FloatArray) -> FloatArray:
         """(35,) configuration, updated by the middle of the ranges of vague twists; its covariance is (32, 32)."""
         soft = self._ranges.soft_coordinates(q)
         gradients = np.zeros((self._space.nv - 6, self._space.nv))

@@ -86,7 +86,7 @@ class Priors:
             state = self._pseudo_measured(state, gradients[rows], -values[rows], noise, self._free(state))
         vague = (variance > (VAGUE * stddev) ** 2) & ~self._postural
         if vague.any() and not state.sources.names:
-            state = self._drawn(state, gradients[vague], values[vague], stddev[vague])
+            state = self._centred(state, gradients[vague], values[vague], stddev[vague])
         beyond = excess != 0.0
         if beyond.any():
             state = self._pushed_back(state, gradients[:-3][beyond], excess[beyond])
@@ -132,7 +132,7 @@ class Priors:
         covariance[space.tangent, space.tangent] += null.T @ missing @ null
         return state.but(covariance=covariance)
 
-    def _drawn(self, state: State, observation: FloatArray, values: FloatArray, stddev: FloatArray) -> State:
+    def _centred(self, state: State, observation: FloatArray, values: FloatArray, stddev: FloatArray) -> State:
         """Move the estimate to the middle of the ranges in unobserved directions; the covariance stays.
 
         Otherwise an unobserved angle would wander with the noise of the observed ones. With orientations only the

@@ -107,7 +107,7 @@ class SkeletonUpdate:
         back = measurement.measured & (measurement.stamp_ns - state.used_ns > _AWAY_NS)
         state = self._corrected(state, measurement, bool(back.any()))
         state = self._poses.searched(state, measurement, back)
-        return self._priors.within(self._priors.bounded(self._measured(state, measurement)))
+        return self._priors.within(self._priors.bounded(self._lengths_updated(state, measurement)))
 
     def _corrected(self, state: State, measurement: Measurement, reappeared: bool) -> State:
         """The Kalman update by the points that pass the gate, and the update of the sensor's errors.
@@ -278,7 +278,7 @@ class SkeletonUpdate:
         sensor = state.sensors.get(measurement.sensor)
         return sensor.stamps[-1] if sensor is not None and sensor.stamps else measurement.stamp_ns
 
-    def _measured(self, state: State, measurement: Measurement) -> State:
+    def _lengths_updated(self, state: State, measurement: Measurement) -> State:
         """Add a frame to the estimator of the lengths, and replace the lengths by its estimate when it is due."""
         space = self._space
         if state.seen is None:
