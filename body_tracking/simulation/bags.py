@@ -1,8 +1,8 @@
-"""Simulated recordings as bags: ``body_tracking simulate``, and ``make-bags`` for those that are shipped.
+"""Simulated recordings as bags: ``body_tracking simulate``, and ``make-bags`` for the shipped ones.
 
 Topics of a simulated bag: ``/<sensor>/skeleton`` of each camera; of each inertial sensor ``/<imu>/imu/data``
-(oriented) or ``/<imu>/imu/data_raw``, and ``/<imu>/imu/mag`` (names of REP-145); ``/ground_truth/skeleton`` with
-everybody's joints, and of the first person ``/ground_truth/model_state`` (as ``/filtered/model_state``) and
+(oriented) or ``/<imu>/imu/data_raw``, and ``/<imu>/imu/mag`` (names of REP-145); ``/ground_truth/skeleton`` with the
+joints of all people, and for the first person ``/ground_truth/model_state`` (as ``/filtered/model_state``) and
 ``/ground_truth/joint_states`` (the angles of ``kinematics.positional``), stamped in the reference clock;
 ``/ground_truth/calibration``, a pose per camera, and ``/ground_truth/calibration/clock``, the other cameras' clocks
 once a second.
@@ -53,7 +53,7 @@ SHIPPED: dict[str, str] = {
     "tpose_slow_down": "slow_down",
     "tpose_torso_twist": "torso_twist",
 }
-"""The recordings in ``bags/`` and their motions: those of the thesis."""
+"""The recordings in ``bags/`` and their motions, those of the thesis."""
 SEED = 20170512
 
 _Message = tuple[int, str, bytes]
@@ -68,7 +68,7 @@ def shipped(name: str, seed: int = SEED) -> Setup:
         seed: of the random generators.
     """
     motion = SHIPPED[name]
-    # one turn less than usual: the demo runs in real time
+    # one repetition less than usual: the demo runs in real time
     return Setup(motion, seconds=22.0 if motion == "torso_twist" else None, seed=seed, standard=True)
 
 
@@ -109,7 +109,7 @@ def _mag_topic(imu: SimulatedImu) -> str:
 
 
 def _messages(recording: SimulatedRecording) -> Iterator[_Message]:
-    """All messages, in no order."""
+    """All messages, unordered."""
     for sensor in recording.sensors:
         transform = pose_to_transform(sensor.pose, WORLD, BAG_MESSAGES)
         yield RECEIVED_FROM_NS, graph.TRUE_CALIBRATION, serialize(transform)
@@ -274,7 +274,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _imus(args: argparse.Namespace) -> Iterator[SimulatedImu]:
-    """The requested inertial sensors, each with a clock of its own."""
+    """The requested inertial sensors, each with its own clock."""
     segments = [segment for segment in args.imus.split(",") if segment]
     twice = sorted({segment for segment in segments if segments.count(segment) > 1})
     if twice:
@@ -302,7 +302,7 @@ def _layout_of(args: argparse.Namespace) -> Layout:
 
 
 def make_bags(args: argparse.Namespace) -> int:
-    """``body_tracking make-bags``: write the bags, replacing those that are there."""
+    """``body_tracking make-bags``: write the bags, replacing existing ones."""
     for name in SHIPPED:
         if args.motion in (None, name):
             recording = simulate(shipped(name, args.seed))

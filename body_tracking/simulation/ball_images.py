@@ -1,4 +1,4 @@
-"""Rendered scenes of balls before one camera, and how far detection is off, for tests and benchmarks."""
+"""Rendered scenes of balls in front of one camera, and errors of their detection, for tests and benchmarks."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ _GRID = np.stack(np.meshgrid(np.arange(40, 620, 58), np.arange(40, 450, 58)), ax
 
 
 def at(pixels: FloatArray, depths: FloatArray) -> FloatArray:
-    """Points (n, 3) that are seen at pixels (n, 2)."""
+    """Points (n, 3) that project to pixels (n, 2) at depths (n,), metres."""
     rays = CAMERA.rays(pixels)
     return rays / rays[:, 2:] * depths[:, None]
 
 
 def apart(seed: int, low: float, high: float, sensor: Sensor, count: int = 15, glints: int = 0) -> Rendered:
-    """Balls that do not touch; depths, metres."""
+    """Balls that do not touch, at depths from ``low`` to ``high``, metres."""
     random = np.random.default_rng(seed)
     pixels = random.permutation(_GRID)[:count] + random.uniform(-8.0, 8.0, (count, 2))
     points = at(pixels, random.uniform(low, high, count))
@@ -39,7 +39,9 @@ def apart(seed: int, low: float, high: float, sensor: Sensor, count: int = 15, g
 
 
 def overlapping(seed: int, depth: float, behind: float, sensor: Sensor, offset: float = 0.81) -> Rendered:
-    """Two balls, the second behind the first; offset of their centres in radii: 0.81 hides half, at 2 they touch."""
+    """Two balls, the second ``behind`` metres behind the first; ``offset``: centre distance in radii (0.81 hides
+    half).
+    """
     random = np.random.default_rng(seed)
     angle = random.uniform(0.0, 2.0 * np.pi)
     step = offset * 834.0 * 0.5 * DIAMETER / depth * np.array([np.cos(angle), np.sin(angle)])
@@ -48,7 +50,7 @@ def overlapping(seed: int, depth: float, behind: float, sensor: Sensor, offset: 
 
 
 def three_touching(seed: int, depth: float, sensor: Sensor) -> Rendered:
-    """Three balls, each touching the other two, 20 mm behind one another."""
+    """Three balls that touch in the image, each 20 mm behind the previous one."""
     random = np.random.default_rng(seed)
     angle = random.uniform(0.0, 2.0 * np.pi) + np.arange(3) * 2.0 * np.pi / 3.0
     side = DIAMETER / np.sqrt(3.0) * 834.0 / depth
@@ -67,7 +69,7 @@ def cut_by_border(seed: int, depth: float, sensor: Sensor) -> Rendered:
 
 
 def half_hidden(seed: int, depth: float, sensor: Sensor) -> Rendered:
-    """A ball of which a limb in front of it hides half."""
+    """A ball half hidden by a limb in front of it."""
     random = np.random.default_rng(seed)
     angle = random.uniform(0.0, 2.0 * np.pi)
     ball = at(np.array([[300.0, 200.0]]) + random.uniform(-0.5, 0.5, 2), np.array([depth]))
@@ -78,7 +80,7 @@ def half_hidden(seed: int, depth: float, sensor: Sensor) -> Rendered:
 
 
 def found(scenes: Sequence[Rendered]) -> tuple[FloatArray, FloatArray, int, int]:
-    """Errors (n, 2), standard deviations (n, 2), and the numbers of balls that are missed and that are none."""
+    """Errors (n, 2), stated standard deviations (n, 2), and numbers of missed balls and false detections."""
     wrong, stated, missed, extra = [], [], 0, 0
     for scene in scenes:
         balls = detect(scene.image)

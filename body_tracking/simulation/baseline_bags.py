@@ -1,4 +1,4 @@
-"""``body_tracking simulate baseline``: recordings for the thesis's baseline tests, with what is true of them.
+"""``body_tracking simulate baseline``: recordings for the thesis's baseline tests, with ground truth.
 
 Trials of a robot arm with red balls before a colour-and-depth camera, and pendulums of several lengths before an
 infrared and depth camera (Schlagenhauf 2017, section 4.1). Frames are lost, and the times of capture are irregular.
@@ -32,30 +32,30 @@ from body_tracking.simulation.baseline_scenes import ArmScene, PendulumScene
 
 CAMERA: Final = "camera1"
 START_NS: Final = 1_750_000_000 * NANOSECONDS
-"""ROS time of the first second; camera and robot stamp by it."""
+"""ROS time of time 0; camera and robot stamp by it."""
 LENGTHS: Final = (0.25, 0.4, 0.55, 0.75, 1.0)
-"""Of the five pendulums, metres."""
+"""Lengths of the five pendulums, metres."""
 DELAY: Final = 0.04
-"""Seconds by which the camera's stamps follow the robot's, unless told."""
+"""Default delay of the camera's stamps against the robot's, seconds."""
 _RATE: Final = 30.0
 _ROBOT_RATE: Final = 100.0
 _LOST: Final = 0.1
-"""Share of the images that are lost."""
+"""Share of lost images."""
 _JITTER: Final = 0.01
-"""Standard deviation of the times of capture about those of an even rate, seconds."""
+"""Standard deviation of the capture times about an even rate, seconds."""
 _DELAY_NS: Final = 30_000_000
-"""From the capture of an image to its receipt, at least."""
+"""Least time from the capture of an image to its receipt."""
 _LEAD: Final = 0.8
-"""Longest time before the robot's motion from which on is recorded, seconds."""
+"""Longest recording before the robot's motion begins, seconds."""
 _CHUNK_BYTES: Final = 32 << 20
 
 
 class BaselineError(BodyTrackingError):
-    """Such recordings cannot be simulated."""
+    """Raised for arguments of a recording that cannot be simulated."""
 
 
 def capture_times(seconds: float, rng: np.random.Generator, rate: float = _RATE, lost: float = _LOST) -> FloatArray:
-    """(n,) s, increasing, from 0 to ``seconds``: irregular, and some of them lost."""
+    """(n,) s, increasing, from 0 to ``seconds``: irregular, with lost frames."""
     even = np.arange(round(seconds * rate)) / rate
     times = even + rng.normal(0.0, _JITTER, len(even))
     kept = np.sort(times[(rng.random(len(even)) >= lost) & (times >= 0.0)])
@@ -68,11 +68,11 @@ def write_arm(
     """Write one trial as a bag: colour and depth images, calibrations, and the robot's balls.
 
     Args:
-        scene: of the trial; its seed is that of the times, too.
+        scene: of the trial; its seed also determines the capture times.
         folder: the bag.
-        delay: s by which the camera's stamps follow the robot's.
-        rate: images a second.
-        overwrite: replace a bag that is there.
+        delay: s by which the camera's stamps lag the robot's.
+        rate: images per second.
+        overwrite: replace an existing bag.
 
     Raises:
         BagError: the folder exists and ``overwrite`` is false, or it cannot be written.
@@ -117,7 +117,7 @@ def write_arm(
 def write_pendulum(
     scene: PendulumScene, folder: Path, seconds: float, *, camera: str = CAMERA, overwrite: bool = False
 ) -> None:
-    """Write a swing as a bag: infrared and depth images with their calibration.
+    """Write a pendulum's swing as a bag: infrared and depth images with their calibration.
 
     Raises:
         BagError: the folder exists and ``overwrite`` is false, or it cannot be written.
@@ -131,7 +131,7 @@ def write_pendulum(
         bag.add_topic(info_beside(infrared), CAMERA_INFO, LATCHED)
         _write_info(bag, info_beside(infrared), own)
         times = capture_times(seconds, rng)
-        # images come later by whatever the computer does meanwhile; their stamps are those of the capture
+        # the receipt is delayed by the computer's load; the stamps are capture times
         late = rng.exponential(0.005, len(times))
         progress = Progress(0, len(times))
         for number, (time, ball) in enumerate(zip(times.tolist(), scene.balls(times), strict=True)):

@@ -1,8 +1,8 @@
-"""What a camera sees of a robot arm with red balls, and of a pendulum with a retro-reflective ball.
+"""Rendered images of a robot arm with red balls, and of a pendulum with a retro-reflective ball.
 
-The scenes of the thesis's baseline tests (Schlagenhauf 2017, sections 4.1.1 and 4.1.2). The errors of depth are those
-of :mod:`body_tracking.mesh.simulated`. Not simulated: errors of the intrinsics and of depth over whole surfaces, blur
-by motion, and that a Kinect takes colour and depth at different times.
+The scenes of the thesis's baseline tests (Schlagenhauf 2017, sections 4.1.1 and 4.1.2). Depth has the errors of
+:mod:`body_tracking.mesh.simulated`. Not simulated: errors of the intrinsics and of depth over whole surfaces, motion
+blur, and a Kinect's different capture times of colour and depth.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from body_tracking.simulation.colour_images import NOISE, colour_camera, exposed
 from body_tracking.simulation.depth_scene import kinect_camera, quad
 
 RADIUS: Final = 0.03
-"""Of the red balls, metres."""
+"""Radius of the red balls, metres."""
 _SHOULDER: Final = 0.5
 """Height of the arm's first joint, metres."""
 _LINKS: Final = (0.4, 0.32)
 _ASIDE: Final = np.array([0.08, 0.0, 0.0])
-"""From a joint, and from the end effector, to its ball: along the joints' axes, on the camera's side."""
+"""Offset from a joint, or the end effector, to its ball: along the joints' axes, towards the camera, metres."""
 _WAYPOINTS: Final = np.array(
     [
         [-0.25, 60.0, -30.0],
@@ -46,33 +46,33 @@ _WAYPOINTS: Final = np.array(
         [0.25, 75.0, -80.0],
     ]
 )
-"""Metres along the linear stage, and degrees of both links above the horizontal: the lines of a painting robot."""
+"""Metres along the linear stage, and degrees of both links above the horizontal: the strokes of a painting robot."""
 _LINE: Final = 1.8
-"""Seconds from one of them to the next."""
+"""Seconds from one waypoint to the next."""
 _REST: Final = 0.5
-"""Seconds of rest before and after."""
+"""Seconds at rest before and after the motion."""
 _PLACE, _AIM = np.array([1.3, -1.7, 0.9]), np.array([0.0, -0.25, 0.6])
-"""Of the camera, in the robot's frame: it looks at the arm at an angle, as in figure 4.3."""
+"""Position and aim of the camera in the robot's frame, metres: it looks at the arm obliquely, as in figure 4.3."""
 _RED, _GREY, _BLUE = (196.0, 30.0, 34.0), (150.0, 152.0, 156.0), (52.0, 70.0, 112.0)
 
 _Mesh = tuple[FloatArray, IntArray]
 
 
 def sphere(radius: float, rings: int = 24) -> _Mesh:
-    """Vertices (n, 3) and faces (m, 3) about the origin, metres."""
+    """Vertices (n, 3) and faces (m, 3) of a sphere about the origin, metres."""
     polar = np.linspace(0.0, np.pi, rings + 1)
     return _turned(radius * np.sin(polar), radius * np.cos(polar), 2 * rings)
 
 
 def rod(radius: float, length: float, around: int = 24) -> _Mesh:
-    """The same of a rod from the origin along z, with flat ends."""
+    """Vertices and faces of a rod from the origin along z, with flat ends, metres."""
     steps = np.linspace(0.0, length, max(2, int(np.ceil(length / 0.05)) + 1))
     profile = np.array([0.0, *(radius,) * len(steps), 0.0])
     return _turned(profile, np.array([steps[0], *steps, steps[-1]]), around)
 
 
 def _turned(radii: FloatArray, heights: FloatArray, around: int) -> _Mesh:
-    """A surface of revolution about z, its normals outwards or inwards."""
+    """A surface of revolution about z; its normals point outwards or inwards."""
     angle = 2.0 * np.pi * np.arange(around) / around
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     flat = radii[:, None, None] * ring
@@ -84,7 +84,7 @@ def _turned(radii: FloatArray, heights: FloatArray, around: int) -> _Mesh:
 
 
 def looking(sensor: str, place: FloatArray, at: FloatArray) -> SensorPose:
-    """The pose of a camera at a place that looks at another one, upright."""
+    """The pose of an upright camera at ``place`` that looks at ``at``."""
     ahead = (at - place) / np.linalg.norm(at - place)
     right = np.cross(ahead, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -92,19 +92,19 @@ def looking(sensor: str, place: FloatArray, at: FloatArray) -> SensorPose:
 
 
 def _smooth(share: FloatArray) -> FloatArray:
-    """From 0 to 1 with neither speed nor acceleration at the ends."""
+    """Smooth step from 0 to 1 with zero speed and acceleration at both ends."""
     s = np.clip(share, 0.0, 1.0)
     return np.asarray(s**3 * (10.0 - 15.0 * s + 6.0 * s**2))
 
 
 @dataclass(frozen=True, eq=False)
 class ArmScene:
-    """A 3-degree-of-freedom arm on a linear stage, after figures 4.1-4.3 of Schlagenhauf 2017.
+    """An arm of three degrees of freedom on a linear stage, after figures 4.1-4.3 of Schlagenhauf 2017.
 
     Attributes:
         seed: of the sensor's errors.
         camera: the colour camera's name.
-        width: pixels of the colour image; the depth image has half of them.
+        width: pixels of the colour image; the depth image has half as many.
         errors: of the depth.
     """
 
@@ -115,7 +115,7 @@ class ArmScene:
 
     @property
     def seconds(self) -> float:
-        """Of the motion, with rest before and after."""
+        """Duration of the motion, including the rest before and after."""
         return 2.0 * _REST + _LINE * (len(_WAYPOINTS) - 1)
 
     @cached_property
@@ -157,7 +157,7 @@ class ArmScene:
             quad((-2.2, -1.0, 0.0), (4.0, 0.0, 0.0), (0.0, 2.6, 0.0)),
             quad((-2.2, 1.6, 0.0), (4.0, 0.0, 0.0), (0.0, 0.0, 2.5)),
             quad((-2.2, -1.0, 0.0), (0.0, 2.6, 0.0), (0.0, 0.0, 2.5)),
-            # a red square on the wall, which is no ball
+            # a red square on the wall as a distractor
             quad((-0.9, 1.59, 0.9), (0.1, 0.0, 0.0), (0.0, 0.0, 0.1)),
         ]
         starts = np.cumsum([0, *(len(points) for points, _ in quads[:-1])])
@@ -205,7 +205,7 @@ class ArmScene:
         return self._optical(np.concatenate(points)), faces.astype(np.int32)
 
     def images(self, time: float, number: int) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
-        """Colour (height, width, 3) and depth, millimetres, at a time in s; ``number`` of the image seeds its noise."""
+        """Colour (height, width, 3) and depth (millimetres) at a time in s; the image's ``number`` seeds its noise."""
         picture, distance, empty = self._room
         vertices, faces = self._mesh(time)
         colour = render(vertices, faces, self.colour)
@@ -214,31 +214,31 @@ class ArmScene:
         corners = vertices[faces[face]]
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
-        # towards the camera, whichever way the face is turned
+        # flip the normals towards the camera
         across *= -np.sign((across * corners[:, 0]).sum(axis=1, keepdims=True))
         rng = np.random.default_rng([self.seed, 43, number])
         shown = exposed(picture, seen, self._parts[1][face], across, rng)
         own = render(vertices, faces, self.depth).depth
         arm = (own > 0.0) & ((distance == 0.0) | (own < distance))
         depth = measured(np.where(arm, own, distance), DepthCamera(self.depth), rng, self.errors)
-        # as of scenes that are still: the room's errors do not change, which makes recordings small
+        # away from the arm the room's errors stay constant, as in still scenes, which makes recordings small
         return shown, np.where(maximum_filter(arm, 5), depth, empty)
 
 
 @dataclass(frozen=True, eq=False)
 class PendulumScene:
-    """A ball on a string that swings across the view of an infrared and depth camera (figure 4.9).
+    """A ball on a string that swings perpendicular to the view of an infrared and depth camera (figure 4.9).
 
     Attributes:
         length: of the string, metres.
-        amplitude: radians, where it is let go.
-        damping: 1/s, of the amplitude.
+        amplitude: radians, at the release.
+        damping: decay rate of the amplitude, 1/s.
         distance: metres from the camera.
         diameter: of the ball, metres.
         seed: of the sensor's errors.
         camera: intrinsics.
-        bolt: whether a bright bolt hangs there, which has depth.
-        depth_at_ball: whether depth is measured at the ball, as of one that is not retro-reflective.
+        bolt: whether a bright bolt, which has depth, is in view.
+        depth_at_ball: whether depth is measured at the ball, as if it were not retro-reflective.
     """
 
     length: float
@@ -252,7 +252,7 @@ class PendulumScene:
     depth_at_ball: bool = False
 
     def angles(self, times: FloatArray) -> FloatArray:
-        """(n,) radians at (n,) s, by the equation of motion: theta'' = -g / L sin(theta) - 2 damping theta'."""
+        """(n,) radians at (n,) s, from the equation of motion theta'' = -g / L sin(theta) - 2 damping theta'."""
 
         def slope(_: float, state: FloatArray) -> list[float]:
             pull = -STANDARD_GRAVITY / self.length * np.sin(state[0])
@@ -263,7 +263,7 @@ class PendulumScene:
         return np.asarray(solved.sol(times)[0])
 
     def balls(self, times: FloatArray) -> FloatArray:
-        """(n, 3) metres in the optical frame; the ball hangs at the middle of the image when at rest."""
+        """(n, 3) metres in the optical frame; at rest the ball is near the middle of the image."""
         theta = self.angles(times)
         across = self.length * np.stack([np.sin(theta), np.cos(theta) - 1.0, np.zeros_like(theta)], axis=-1)
         return np.asarray(across + np.array([0.0, 0.1, self.distance]))
@@ -280,7 +280,7 @@ class PendulumScene:
         return rows, columns
 
     def images(self, ball: FloatArray, number: int) -> tuple[NDArray[Any], NDArray[np.uint16]]:
-        """Infrared and depth, millimetres, with the ball at a place (3,); ``number`` seeds the noise."""
+        """Infrared and depth (millimetres) with the ball at a position (3,); ``number`` seeds the noise."""
         places = [ball, *([np.array([0.25, -0.3, self.distance])] if self.bolt else [])]
         sensor = Sensor(brightness=6.0)
         infrared = render_balls(

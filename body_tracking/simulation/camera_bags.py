@@ -1,8 +1,8 @@
-"""The shipped recordings of simulated cameras: people in clothes in rendered images, with the truth.
+"""The shipped recordings of simulated cameras: people in clothes in rendered images, with ground truth.
 
-One is of a colour-and-depth camera: its depth images are registered to the colour images and have half the pixels in
-each direction. The other is of two colour cameras with their rig. Colour images are JPEG, by the names that
-image_transport gives them.
+One is from a colour-and-depth camera: its depth images are registered to the colour images and have half the pixels in
+each direction. The other is from two colour cameras with their rig. Colour images are JPEG, on the topics of
+image_transport.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ SHIPPED_PAIR: Final = "cameras_turning"
 SECONDS: Final = 10.0
 PAIR_SECONDS: Final = 6.0
 _AROUND: Final = (-0.6, 0.6)
-"""Radians about the person at which the two cameras stand."""
+"""Azimuths of the two cameras around the person, radians."""
 _AWAY, _HEIGHT, _PITCH = 2.6, 1.2, 0.05
-"""Of these cameras: metres from the person and above the floor, and radians by which they look down."""
+"""Distance of these cameras from the person and height above the floor, metres; pitch downwards, radians."""
 _PERSON: Final = 2.2
-"""Metres ahead of the origin of ``world``."""
+"""Distance of the person from the origin of ``world``, metres."""
 _EVERY: Final = 2
-"""Every second image of 30 a second."""
+"""Every second image of 30 per second is used."""
 _WIDTH: Final = 480
-"""Pixels of a colour image; a depth image has half of them."""
+"""Width of a colour image, pixels; a depth image has half of it."""
 _PAIR_FROM: Final = 2.0
-"""Seconds of the motion that are left out: the person stands still."""
+"""Initial part of the motion that is skipped, because the person stands still, seconds."""
 _TRUTH: Final = {
     graph.TRUE_SKELETON: (POINT_CLOUD, SENSOR_DATA),
     graph.TRUE_ANGLES: (JOINT_STATE, RELIABLE),
@@ -66,12 +66,12 @@ _CHUNK_BYTES: Final = 32 << 20
 
 
 def make_shipped(bags: Path, rig_folder: Path) -> None:
-    """Write the shipped recordings and the rig of the second one, replacing what is there.
+    """Write the shipped recordings and the rig of the second one, replacing existing files.
 
     Raises:
-        MakeHumanError: MakeHuman's data are absent.
+        MakeHumanError: MakeHuman's data are missing.
         BagError: a recording cannot be written.
-        RigFileError: the rig cannot.
+        RigFileError: the rig cannot be written.
     """
     people = makehuman_for(SHIPPED)
     scene = DepthScene(held_out(people, 1), "reaching", 1, colour_camera(_WIDTH // 2), still=True)
@@ -86,7 +86,7 @@ def make_shipped(bags: Path, rig_folder: Path) -> None:
 
 
 def pose_around(camera: str, angle: float) -> SensorPose:
-    """The pose in ``world`` of a camera that looks at the person of a scene from the side by so many radians."""
+    """The pose in ``world`` of a camera that looks at the scene's person from an azimuth in radians."""
     level = level_pose(camera, _HEIGHT, _PITCH)
     turned = so3.quat_multiply(so3.exp(np.array([0.0, 0.0, angle])), level.quat_xyzw)
     place = np.array([_PERSON - _AWAY * np.cos(angle), -_AWAY * np.sin(angle), _HEIGHT])
@@ -94,7 +94,7 @@ def pose_around(camera: str, angle: float) -> SensorPose:
 
 
 def rig_of(poses: Sequence[SensorPose], camera: Camera) -> Rig:
-    """The rig of equal cameras at these poses, in the frame of the first one, as exact as its numbers."""
+    """The rig of equal cameras at these poses, in the frame of the first one, with zero covariance."""
     first = poses[0]
     rotations = np.array([pose.rotation.T @ first.rotation for pose in poses])
     translations = np.array([pose.rotation.T @ (first.translation - pose.translation) for pose in poses])
@@ -106,7 +106,7 @@ def rig_of(poses: Sequence[SensorPose], camera: Camera) -> Rig:
 def write_pair_bag(
     scene: DepthScene, poses: Sequence[SensorPose], folder: Path, seconds: float, *, overwrite: bool = False
 ) -> None:
-    """Write colour images of a scene by several cameras as a bag, with progress on stderr.
+    """Write colour images of a scene from several cameras as a bag, with progress on stderr.
 
     Raises:
         BagError: the folder exists and ``overwrite`` is false, or it cannot be written.

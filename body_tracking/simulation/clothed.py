@@ -1,8 +1,8 @@
 """MakeHuman's people driven by the simulator's motions.
 
-Each bone of the rig is turned as the segment of :class:`~body_tracking.kinematics.upper_body.UpperBody` that it
-belongs to; bends of spine and neck are shared out among their bones, and so are the twists of upper arm and forearm, as
-skin follows them. The true joints are the rig's own: they lie elsewhere than those of the tracker's body model.
+Each bone of the rig is rotated as its segment of :class:`~body_tracking.kinematics.upper_body.UpperBody`. Bends of
+spine and neck are distributed over their bones, as are the twists of upper arm and forearm, like skin. The true joints
+are the rig's own; their positions differ from those of the tracker's body model.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from body_tracking.simulation.people import MODEL, Course, Person, joints
 
 _SIDES: Final = (("left", "L", 0), ("right", "R", 1))
 _SEGMENT: Final = {name: number for number, name in enumerate(MODEL.segment_names)}
-# bone: segments between which it lies, and its share of the second
+# bone: the two segments that it interpolates, and the share of the second
 _TRUNK: Final = {
     "root": ("pelvis", "pelvis", 0.0),
     "spine05": ("pelvis", "pelvis", 0.0),
@@ -33,7 +33,7 @@ _TRUNK: Final = {
     "head": ("head", "head", 0.0),
 }
 _HEAD_CENTRE: Final = 0.05
-"""Of a head above its joint, as a share of the stature."""
+"""Height of the head's centre above its joint, as a share of the stature."""
 _ARM_JOINTS: Final = (("SHOULDER", "upperarm01"), ("ELBOW", "lowerarm01"), ("WRIST", "wrist"))
 _LEG_JOINTS: Final = (("HIP", "upperleg01"), ("KNEE", "lowerleg01"), ("ANKLE", "foot"), ("FOOT", "toe2-1"))
 _HAND_JOINTS: Final = (("HAND", "finger3-1"), ("HAND_TIP", "finger3-3"), ("THUMB", "finger1-3"))
@@ -45,7 +45,7 @@ class ClothedPerson:
 
     Attributes:
         body: MakeHuman's.
-        person: the simulator's, with the lengths between the body's joints: for its motions.
+        person: the simulator's person with the lengths between the body's joints, for its motions.
     """
 
     body: Body
@@ -87,7 +87,7 @@ class ClothedPerson:
         return cls(body, person)
 
     def posed(self, course: Course, instant: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The surface at an instant of a course.
+        """The surface at one instant of a course.
 
         Returns:
             (N, 3) vertices, (25, 3) joints, metres in the course's frame, and (12, 3, 3) rotations of the segments.
@@ -103,7 +103,7 @@ class ClothedPerson:
         return vertices, _kinect_joints(body, heads, rotations[body.rig.names.index("head")]), segments
 
     def _rotations(self, segments: FloatArray, skeleton: FloatArray) -> FloatArray:
-        """(B, 3, 3) of each bone against its rest."""
+        """(B, 3, 3) rotation of each bone relative to its rest pose."""
         body, found = self.body, dict[str, FloatArray]()
         for bone, (first, second, share) in _TRUNK.items():
             one, other = segments[_SEGMENT[first]], segments[_SEGMENT[second]]
@@ -140,7 +140,7 @@ class ClothedPerson:
 
 
 def _kinect_joints(body: Body, heads: FloatArray, head: FloatArray) -> FloatArray:
-    """(25, 3) joints of the Kinect's set at the places (B, 3) of the bones' ends; ``head`` is its rotation."""
+    """(25, 3) joints of the Kinect's set from the bones' heads (B, 3); ``head``: rotation of the head bone."""
     place = dict(zip(body.rig.names, heads, strict=True))
     found = np.empty((N_JOINTS, 3))
     found[Joint.SPINE_BASE], found[Joint.SPINE_MID], found[Joint.NECK] = (
@@ -163,13 +163,13 @@ def _frame(up: FloatArray, forward: FloatArray) -> FloatArray:
 
 
 def _part(rotation: FloatArray, share: float) -> FloatArray:
-    """(3, 3) a share of a rotation."""
+    """(3, 3) the rotation by a share of a rotation's angle."""
     vector = so3.log(so3.matrix_to_quat(rotation))
     return so3.quat_to_matrix(so3.exp(share * vector))
 
 
 def _untwisted(relative: FloatArray) -> FloatArray:
-    """(3, 3) that takes half of a joint's twist about its own z back; the twist fades where a half turn hides it."""
+    """(3, 3) rotation that removes half of a joint's twist about its own z; fades out near a half turn of swing."""
     _, _, z, w = so3.matrix_to_quat(relative)
     size = z * z + w * w
     angle = 2.0 * np.arctan2(np.sign(w) * z, abs(w)) * min(1.0, size / 0.25)

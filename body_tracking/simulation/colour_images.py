@@ -1,7 +1,7 @@
-"""Colour images of a simulated person in a room, for the networks that find people in images.
+"""Colour images of a simulated person in a room, for networks that detect people in images.
 
-Nothing of it is learned or measured: skin, hair, eyes, mouth and clothes have a colour each, and a lamp shines from
-above the camera. The networks were trained on photographs; their errors on these images are taken as they are.
+Nothing is learned or measured: skin, hair, eyes, mouth and clothes have one colour each, and a lamp shines from above
+the camera. The networks were trained on photographs; their errors on these images are accepted.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ _LAMP: Final[FloatArray] = np.array([0.25, -0.65, -0.72])
 """Direction to the lamp in the optical frame."""
 _AMBIENT: Final = 0.45
 _EYE, _BROW, _MOUTH = 0.013, 0.012, 0.022
-"""Metres about the middle of an eye, of an eyebrow above it, and of the mouth, that have their colour."""
+"""Radii about the middle of an eye, of an eyebrow above it, and of the mouth, with their colour, metres."""
 _ON_FLOOR: Final = 0.01
-"""Metres above the floor up to which a face of the room is the floor."""
+"""Largest height of a face of the room that counts as floor, metres."""
 CAMERA: Final = "camera1"
 NOISE: Final = 4.0
-"""Standard deviation of a pixel, of 255."""
+"""Standard deviation of a pixel's noise, of 255."""
 
 
 def colour_camera(width: int = 640) -> Camera:
-    """A camera of 4:3, 69 degrees wide, without lens distortion."""
+    """A camera with an aspect ratio of 4:3, 69 degrees wide, without lens distortion."""
     height, focal = width * 3 // 4, 465.0 / 640.0 * width
     matrix = np.array([[focal, 0.0, (width - 1) / 2.0], [0.0, focal, (height - 1) / 2.0], [0.0, 0.0, 1.0]])
     return Camera(optical_frame(CAMERA), width, height, matrix, np.zeros(5))
@@ -42,16 +42,16 @@ def colour_camera(width: int = 640) -> Camera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Painter:
-    """Paints the images of a scene.
+    """Renders the colour images of a scene.
 
     Attributes:
         scene: of a person in a room.
         camera: intrinsics.
         pose: of the camera in ``world``.
-        faces: (F, 3) of the body without the strands of hair, which would hide the face of the person.
-        colours: (F, 3) red, green, blue of each of them.
+        faces: (F, 3) of the body without the strands of hair, which would hide the person's face.
+        colours: (F, 3) red, green, blue of each face.
         background: (height, width, 3) the room.
-        distance: (height, width) metres to it; 0 where there is nothing.
+        distance: (height, width) metres to the room; 0 where there is nothing.
     """
 
     scene: DepthScene
@@ -64,7 +64,7 @@ class Painter:
 
     @classmethod
     def of(cls, scene: DepthScene, camera: Camera | None = None, pose: SensorPose | None = None) -> Painter:
-        """With colours drawn by the scene's seed; the scene's own camera at its own place where none is given."""
+        """With colours drawn by the scene's seed; defaults are the scene's own camera and pose."""
         camera, pose = camera or scene.camera, pose or scene.pose
         vertices, faces = scene.room()
         world = scene.pose.apply(vertices)
@@ -94,14 +94,14 @@ class Painter:
 def exposed(
     background: FloatArray, seen: BoolArray, colours: FloatArray, direction: FloatArray, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """(height, width, 3) red, green, blue of lit surfaces before a background, with noise and blur.
+    """(height, width, 3) red, green, blue of lit surfaces in front of a background, with noise and blur.
 
     Args:
-        background: (height, width, 3), whose noise is in it.
-        seen: (height, width) the n pixels of the surfaces.
-        colours: (n, 3) of them.
-        direction: (n, 3) their normals in the optical frame.
-        rng: of their noise.
+        background: (height, width, 3), with noise.
+        seen: (height, width) mask of the n pixels of the surfaces.
+        colours: (n, 3) of these pixels.
+        direction: (n, 3) normals in the optical frame.
+        rng: for the surfaces' noise.
     """
     light = _AMBIENT + (1.0 - _AMBIENT) * np.clip(direction @ (_LAMP / np.linalg.norm(_LAMP)), 0.0, 1.0)
     picture = background.copy()

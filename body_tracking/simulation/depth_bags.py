@@ -1,7 +1,7 @@
-"""Recordings of a simulated depth camera as bags, the one that is shipped among them.
+"""Recordings of a simulated depth camera as bags, including the shipped one.
 
-Topics: depth images and their ``camera_info``, the skeletons that a Kinect v2 would report beside them, a wrist-worn
-inertial sensor on each forearm, and the truth: joints, angles, the camera's pose.
+Topics: depth images and their ``camera_info``, simulated skeletons of a Kinect v2, an inertial sensor on each wrist,
+and the ground truth: joints, angles, the camera's pose.
 """
 
 from __future__ import annotations
@@ -39,28 +39,28 @@ SHIPPED: Final = "mesh_reaching"
 """The recording in ``bags/``."""
 SECONDS: Final = 10.0
 _DELAY_NS: Final = 30_000_000
-"""From the capture of an image to its receipt."""
+"""Time from the capture of an image to its receipt."""
 _CHUNK_BYTES: Final = 32 << 20
-"""Large chunks, as an image differs little from the one before: they compress to a third of what small ones do."""
+"""Large chunks: consecutive images differ little, so they compress to a third of the size of small chunks."""
 _FOREARMS: Final = ("forearm_left", "forearm_right")
 
 _Message = tuple[int, str, bytes]
 
 
 def shipped_scene() -> DepthScene:
-    """The scene of the shipped recording; every second pixel of a Kinect v2 in each direction.
+    """The scene of the shipped recording, with every second pixel of a Kinect v2 in each direction.
 
     Raises:
-        MakeHumanError: MakeHuman's data are absent.
+        MakeHumanError: MakeHuman's data are missing.
     """
     return DepthScene(held_out(makehuman_for(SHIPPED), 4), "reaching", 4, kinect_camera(2), still=True)
 
 
 def make_shipped(bags: Path) -> None:
-    """Write the shipped recording, replacing one that is there.
+    """Write the shipped recording, replacing an existing one.
 
     Raises:
-        MakeHumanError: MakeHuman's data are absent.
+        MakeHumanError: MakeHuman's data are missing.
         BagError: the recording cannot be written.
     """
     write_depth_bag(shipped_scene(), bags / SHIPPED, SECONDS, overwrite=True)
@@ -106,13 +106,13 @@ def write_depth_bag(scene: DepthScene, folder: Path, seconds: float, *, overwrit
 
 
 def capture_times(seconds: float, delay_ns: int = _DELAY_NS) -> tuple[int, int]:
-    """Stamp of an image by the reference clock, and when it was received."""
+    """Stamp of an image by the reference clock, and its time of receipt, nanoseconds."""
     elapsed_ns = round(seconds * NANOSECONDS)
     return START_NS + elapsed_ns, RECEIVED_FROM_NS + elapsed_ns + delay_ns
 
 
 def truth_messages(joints: FloatArray, stamp_ns: int, log_ns: int) -> Iterator[tuple[int, str, bytes]]:
-    """Log time, topic and content of (25, 3) true joints in ``world``, and of their angles."""
+    """Log time, topic and message of (25, 3) true joints in ``world``, and of their angles."""
     truth = Skeleton(stamp_ns, WORLD, joints, np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8))
     yield log_ns, graph.TRUE_SKELETON, encode_skeletons([truth])
     angles = angles_to_joint_state(positional_angles(truth), graph.DEFAULT_BODY, WORLD, BAG_MESSAGES)
@@ -120,7 +120,7 @@ def truth_messages(joints: FloatArray, stamp_ns: int, log_ns: int) -> Iterator[t
 
 
 def _skeletons(scene: DepthScene, joints: FloatArray) -> Iterator[_Message]:
-    """What a Kinect v2 reports of (n, 25, 3) true joints in ``world``, with the stamps of the depth images."""
+    """Simulated skeletons of a Kinect v2 from (n, 25, 3) true joints in ``world``, stamped as the depth images."""
     kinect = SimulatedKinect(scene.pose, ClockModel(anchor_ns=START_NS))
     rng, times = np.random.default_rng([scene.seed, 3]), np.arange(len(joints)) / RATE
     misreading = Misreading.draw(np.random.default_rng([scene.seed, 6]))
@@ -136,7 +136,7 @@ def _skeletons(scene: DepthScene, joints: FloatArray) -> Iterator[_Message]:
 def inertial_messages(
     scene: DepthScene, seconds: float, segments: Sequence[str] = _FOREARMS, rate: float = 100.0
 ) -> Iterator[tuple[int, str, bytes]]:
-    """Log time, topic and content of the readings of worn sensors, oriented by their own fusion, in no order."""
+    """Log time, topic and message of the readings of worn sensors with their own orientation filters, unordered."""
     for number, segment in enumerate(segments):
         place = MODEL.segment_names.index(segment)
 

@@ -1,4 +1,4 @@
-"""Depth images of a simulated person in clothes, who moves in a room before a depth camera, with the truth."""
+"""Depth images of a simulated person in clothes who moves in a room in front of a depth camera, with ground truth."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from body_tracking.simulation.people import Course
 from body_tracking.simulation.repertoire import Movement, make_movement
 
 RATE: Final = 30.0
-"""Images a second."""
+"""Images per second."""
 SENSOR: Final = "kinect1"
 _HEIGHT, _PITCH, _DISTANCE, _WALL = 1.0, 0.03, 2.2, 3.6
-"""Of the camera above the floor, metres; its pitch downwards, radians; metres to the person and to the wall behind."""
+"""Height of the camera above the floor, metres; pitch downwards, radians; distances to person and wall, metres."""
 _TABLE: Final = ((-0.75, -0.35), (1.55, 2.0), 0.72)
-"""A table before the person: its sides across and ahead of the camera, and its height, metres."""
+"""A table before the person: extents across and ahead of the camera, and height, metres."""
 
 
 def kinect_camera(scale: int = 1) -> Camera:
-    """The depth camera of a Kinect v2 with the focal length of the SDK, or one with 1/scale of its pixels."""
+    """The depth camera of a Kinect v2 with the SDK's focal length, or with 1/scale of the pixels in each direction."""
     width, height, focal = 512 // scale, 424 // scale, 365.5 / scale
     centre = (256.5 / scale - 0.5, 208.0 / scale - 0.5)
     matrix = np.array([[focal, 0.0, centre[0]], [0.0, focal, centre[1]], [0.0, 0.0, 1.0]])
@@ -41,16 +41,16 @@ def kinect_camera(scale: int = 1) -> Camera:
 
 
 class DepthFrame(NamedTuple):
-    """One image with the truth.
+    """One image with its ground truth.
 
     Attributes:
         time: seconds.
         image: (height, width) millimetres, 0 where missing.
-        true_depth: (height, width) metres, without the sensor's errors.
-        person: (height, width) pixels of the person.
+        true_depth: (height, width) metres, without sensor errors.
+        person: (height, width) mask of the person.
         joints: (25, 3) metres in the optical frame.
         segments: (12, 3, 3) rotations of ``UpperBody``'s segments in the optical frame.
-        vertices: (N, 3) surface, metres in the optical frame.
+        vertices: (N, 3) of the surface, metres in the optical frame.
     """
 
     time: float
@@ -64,19 +64,19 @@ class DepthFrame(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthScene:
-    """A person and a motion before a camera.
+    """A person and a motion in front of a camera.
 
     Attributes:
         who: the person.
         motion: one of ``repertoire.MOTIONS``.
-        seed: of the manner and of the sensor's errors.
+        seed: of the person's manner and the sensor's errors.
         camera: intrinsics.
         errors: of the depth.
-        seconds: of the motion; its own length where None.
-        standard: without an individual manner.
-        table: whether a table stands before the person's left side.
-        speed: factor of the motion's speed.
-        still: whether the errors of the room are the same in all images, which makes recordings small.
+        seconds: of the motion; None for its own length.
+        standard: perform the motion without an individual manner.
+        table: whether a table stands in front of the person's left side.
+        speed: factor on the motion's speed.
+        still: whether the errors of the room are constant over images, which makes recordings small.
     """
 
     who: ClothedPerson
@@ -92,7 +92,7 @@ class DepthScene:
 
     @property
     def pose(self) -> SensorPose:
-        """The camera in ``world``: origin on the floor below it."""
+        """The camera in ``world``, whose origin is on the floor below the camera."""
         return level_pose(SENSOR, _HEIGHT, _PITCH)
 
     @property
@@ -106,13 +106,13 @@ class DepthScene:
         return zlib.crc32(self.motion.encode())
 
     def course(self, times: FloatArray) -> Course:
-        """The body at (n,) seconds in ``world``: the person faces the camera."""
+        """The body at (n,) seconds in ``world``, facing the camera."""
         movement = self.movement
         inside = np.clip(times * self.speed, 0.0, movement.duration)
         return movement.course(inside).placed(np.array([_DISTANCE, 0.0, 0.0]), np.pi)
 
     def frames(self, start: float = 0.0, stop: float | None = None, step: int = 1) -> Iterator[DepthFrame]:
-        """The images from ``start`` to ``stop`` seconds, every ``step``-th; each has its own random generator."""
+        """Every ``step``-th image from ``start`` to ``stop`` seconds; each has its own random generator."""
         count = int(min(self.movement.duration / self.speed, np.inf if stop is None else stop) * RATE)
         numbers = np.arange(round(start * RATE), count, step)
         course = self.course(numbers / RATE)
@@ -140,9 +140,9 @@ class DepthScene:
         return Floor(self.pose.rotation.T @ [0.0, 0.0, 1.0], _HEIGHT)
 
     def room(self) -> tuple[FloatArray, NDArray[np.int32]]:
-        """Vertices (n, 3) of floor, wall and table, in the optical frame, and faces (m, 3), the floor's first.
+        """Vertices (n, 3) of floor, wall and table in the optical frame, metres, and faces (m, 3), the floor's first.
 
-        The faces are small, as lens distortion bends their edges.
+        The faces are small, because lens distortion bends their edges.
         """
         quads = [
             quad((0.4, -4.0, 0.0), (_WALL - 0.4, 0.0, 0.0), (0.0, 8.0, 0.0)),
@@ -163,7 +163,7 @@ class DepthScene:
 def quad(
     corner: tuple[float, float, float], one: tuple[float, float, float], other: tuple[float, float, float]
 ) -> tuple[FloatArray, NDArray[np.int32]]:
-    """A parallelogram by a corner and two sides, in faces of a decimetre."""
+    """A parallelogram from a corner and two sides, metres, with faces of a decimetre."""
     a, b = np.array(one), np.array(other)
     rows, columns = (int(np.ceil(np.linalg.norm(side) / 0.1)) + 1 for side in (a, b))
     along, across = np.meshgrid(np.linspace(0.0, 1.0, rows), np.linspace(0.0, 1.0, columns), indexing="ij")
@@ -175,5 +175,5 @@ def quad(
 
 
 def held_out(data: MakeHuman, seed: int) -> ClothedPerson:
-    """A person to be judged on; the same seed gives the same one."""
+    """A person for evaluation, determined by the seed."""
     return ClothedPerson.of(data.draw(np.random.default_rng([seed, 20180718])))

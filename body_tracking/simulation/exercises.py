@@ -17,12 +17,12 @@ def _nothing() -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Exercise:
-    """A motion on the spot between two T-poses: a periodic swing, or a round of postures.
+    """A motion on the spot between two T-poses: a periodic swing, or a sequence (round) of postures.
 
     Attributes:
-        start: (35,) the posture at its beginning.
+        start: (35,) initial posture.
         repetitions: of the standard performance.
-        period: seconds of a repetition; 0 for a round.
+        period: seconds per repetition; 0 for a round.
         out: (35,) amplitude of (1 - cos) / 2.
         sine: (35,) amplitude of the sine.
         left, right: (35,) amplitudes of the cube of the sine in the first and in the second half.
@@ -40,11 +40,11 @@ class Exercise:
 
     @property
     def round_s(self) -> float:
-        """Seconds of a repetition."""
+        """Seconds per repetition."""
         return self.period or sum(move + stay for _, move, stay in self.round)
 
     def at(self, phase: FloatArray) -> FloatArray:
-        """(n, 35) the swing's additions at phases (n, 35), in periods."""
+        """(n, 35) additions of the swing to the posture at phases (n, 35), in periods."""
         turn = 2.0 * np.pi * phase
         sine = np.sin(turn)
         result: FloatArray = (
@@ -73,7 +73,7 @@ def _arm_raises() -> Exercise:
 
 _LOW_LEGS = {"drop": 0.10, "forward": -0.07, "pelvis_flexion": 24.0}
 _TARGETS: tuple[FloatArray, ...] = (
-    # with the right arm: ahead, across, up, down, to the side
+    # with the right arm: ahead, across, up, down, sideways
     posture(
         elevation_right=86.0, plane_right=84.0, elbow_right=12.0, reach_right=8.0, trunk_flexion=8.0, trunk_axial=12.0
     ),
@@ -104,7 +104,7 @@ _OTHER_ARM = posture(
 
 
 def _reaching(rng: np.random.Generator | None) -> Exercise:
-    """To five targets, with alternating arms."""
+    """Reaching for five targets, with alternating arms."""
     targets = [target + _OTHER_ARM for target in _TARGETS]
     targets = [target if number % 2 == 0 else mirrored(target) for number, target in enumerate(targets)]
     if rng is not None:
@@ -117,7 +117,7 @@ def _reaching(rng: np.random.Generator | None) -> Exercise:
 
 
 def _hair_combing(rng: np.random.Generator | None) -> Exercise:
-    """One hand from the forehead over the crown to the nape, in a stroke, and back through the air."""
+    """One hand combs from the forehead over the crown to the nape in a stroke, and returns through the air."""
     front = posture(elevation_right=118.0, plane_right=46.0, elbow_right=127.0)
     back = posture(elevation_right=145.0, plane_right=34.0, twist_right=-66.0, elbow_right=140.0)
     crown = posture(elevation_right=-2.0, twist_right=2.0, elbow_right=-13.0)
@@ -129,9 +129,9 @@ def _hair_combing(rng: np.random.Generator | None) -> Exercise:
 
 
 def _forearm_rolling() -> Exercise:
-    """Both forearms before the chest, rolling about each other."""
+    """Both forearms in front of the chest, rolling about each other."""
     centre = posture(elevation=48.0, plane=46.0, twist=54.0, elbow=111.0, pronation=40.0)
-    # these move a left hand 9 cm forward, and up
+    # these additions move a left hand 9 cm forward, and up
     forward = posture(plane_left=4.0, twist_left=-7.5, elbow_left=-12.5)
     up = posture(plane_left=1.6, twist_left=-10.5, elbow_left=8.5)
     forward, up = forward - mirrored(forward), up - mirrored(up)
@@ -161,14 +161,14 @@ EXERCISES: dict[str, Exercise | Callable[[np.random.Generator | None], Exercise]
         1.6,
         out=posture(elevation=14.0, elbow=-75.0),
     ),
-    # both arms forward, palms down, pressing down and rising again in the sagittal plane (section 4.3.3)
+    # both arms forward, palms down, pressed down and raised in the sagittal plane (section 4.3.3)
     "slow_down": Exercise(
         posture(elevation=105.0, plane=82.0, twist=22.0, elbow=60.0, pronation=60.0, wrist_flexion=-15.0),
         5,
         2.0,
         out=posture(elevation=-60.0, elbow=-35.0, trunk_flexion=6.0),
     ),
-    # the left arm points to the left; the right hand goes round an ellipse (section 4.3.4)
+    # the left arm points to the left; the right hand moves on an ellipse (section 4.3.4)
     "move_along": Exercise(
         _MOVE_ALONG,
         5,
@@ -176,8 +176,8 @@ EXERCISES: dict[str, Exercise | Callable[[np.random.Generator | None], Exercise]
         out=posture(plane_right=60.0, twist_right=45.0, elbow_right=15.0, trunk_axial=3.0, plane_left=3.0),
         sine=posture(elevation_right=20.0, elbow_right=-20.0),
     ),
-    # arms out, the shoulders' line turning by about 90 degrees to each side against the feet (section 5.6.1): hips,
-    # spine and shoulder girdle share the turn, and the foot left behind pivots on its toes
+    # arms out, shoulders turning by about 90 degrees to each side relative to the feet (section 5.6.1): hips, spine and
+    # shoulder girdle share the rotation, and the foot left behind pivots on its toes
     "torso_twist": Exercise(
         posture(elevation=82.0, plane=6.0, elbow=12.0),
         5,
@@ -186,7 +186,7 @@ EXERCISES: dict[str, Exercise | Callable[[np.random.Generator | None], Exercise]
         left=_PIVOT,
         right=mirrored(_PIVOT),
     ),
-    # down until the thighs are almost level, the arms forward for balance (section 5.8, figure 5.16)
+    # down until the thighs are almost level, arms forward for balance (section 5.8, figure 5.16)
     "squat": Exercise(
         HANGING,
         5,
@@ -209,7 +209,7 @@ EXERCISES: dict[str, Exercise | Callable[[np.random.Generator | None], Exercise]
     "reaching": _reaching,
     "hair_combing": _hair_combing,
     "forearm_rolling": _forearm_rolling(),
-    # from a boxer's guard, left and right in turn
+    # from a boxer's guard, alternating left and right
     "punching": Exercise(
         posture(elevation=32.0, plane=55.0, twist=15.0, elbow=128.0, pronation=10.0, drop=0.03, trunk_flexion=6.0),
         8,
@@ -220,7 +220,7 @@ EXERCISES: dict[str, Exercise | Callable[[np.random.Generator | None], Exercise]
     # both shoulders up and down, the arms hanging
     "shoulder_lifts": Exercise(HANGING, 6, 1.8, out=posture(shrug=26.0, elevation=3.0, elbow=6.0)),
 }
-"""By name; random ones are functions of a generator, or of None for the standard performance.
+"""Exercises by name; random ones are functions of a generator, or of None for the standard performance.
 
 The first six are the thesis's (Schlagenhauf 2017, sections 4.3.3-4.3.4 with figures 4.14 and 4.18, section 5.6.1,
 section 5.8 with figure 5.16). Arm raises, hair combing, forearm rolling, punching and shoulder lifts are among those of

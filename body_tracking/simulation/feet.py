@@ -1,4 +1,4 @@
-"""Feet that stand, rise and step, and the height of the pelvis above them."""
+"""Feet that stand, lift and step, and the height of the pelvis above them."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from body_tracking.simulation.people import Person
 from body_tracking.simulation.postures import PELVIS_QUATERNION, at
 
 _STANCE = 0.055
-"""Half the distance of the ankles when standing, as a share of the stature."""
+"""Half the distance between the ankles when standing, as a share of the stature."""
 _TOE_OUT = np.radians(8.0)
 _BEHIND = 0.03
 """Distance of the ankles behind the hips when standing, as a share of the stature."""
 _STRAIGHT = 0.998
-"""Share of a leg's length to which a knee straightens."""
+"""Largest distance of hip and ankle as a share of the leg's length."""
 _SOFTNESS = 0.006
-"""Metres within which one leg after the other carries the pelvis."""
+"""Metres within which the support changes smoothly from one leg to the other."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Feet:
-    """Where the feet are: the FOOT points (n, 2, 3) metres, headings (n, 2) and pitches (n, 2), radians.
+    """Poses of the feet: FOOT points (n, 2, 3) metres, headings (n, 2) and pitches (n, 2), radians.
 
     A pitch lifts the heel; the sole of a foot with pitch 0 is parallel to the floor.
     """
@@ -36,7 +36,7 @@ class Feet:
     pitch: FloatArray
 
     def ankles(self, person: Person) -> FloatArray:
-        """(n, 2, 3) metres."""
+        """(n, 2, 3) ankle positions, metres."""
         flat = np.arcsin((person.ankle_height - person.toe_height) / person.foot)
         along, up = person.foot * np.cos(flat + self.pitch), person.foot * np.sin(flat + self.pitch)
         back = np.stack([-along * np.cos(self.heading), -along * np.sin(self.heading), up], axis=-1)
@@ -64,14 +64,14 @@ def _footprints(person: Person, places: FloatArray, yaw: FloatArray) -> tuple[Fl
 
 
 def standing(person: Person, postures: FloatArray) -> Feet:
-    """Feet on the spot, with rising heels and pivoting on the toes."""
+    """Feet on the spot, with heel rise and pivoting on the toes."""
     toes, heading = _footprints(person, np.zeros((1, 2)), np.zeros(1))
     inward = np.radians(postures[:, at("pivot")]) * [-1.0, 1.0]
     return Feet(np.tile(toes, (len(postures), 1, 1)), heading + inward, np.radians(postures[:, at("heel")]))
 
 
 def carried(person: Person, q: FloatArray, ankles: FloatArray, drop: FloatArray) -> FloatArray:
-    """(n,) metres, height of the pelvis: ``drop`` (n,) metres below the greatest height that both legs reach."""
+    """(n,) height of the pelvis, metres: ``drop`` (n,) metres below the greatest height that both legs reach."""
     hips = np.array(
         [
             [0.0, sign * person.length(f"hip_width_{side}"), -person.length("hip_drop")]
@@ -88,19 +88,19 @@ def carried(person: Person, q: FloatArray, ankles: FloatArray, drop: FloatArray)
 
 
 class Steps:
-    """Feet that follow a path: in turn, each foot swings to the path's place of half a stance later.
+    """Feet that follow a path: in turn, each foot swings to the path's position at the middle of its next stance.
 
     Args:
         person: the body.
-        path: (n,) seconds to places (n, 2), metres, and headings (n,), radians.
+        path: from (n,) seconds to positions (n, 2), metres, and headings (n,), radians.
         begin, end: seconds between which steps begin.
-        step_s: seconds from a step to the next one's.
+        step_s: seconds between the starts of two steps.
     """
 
     _SWING = 0.84
-    """Seconds that a foot is in the air, per step: 42 % of a stride."""
+    """Share of ``step_s`` that a foot is in the air: 42 % of a stride."""
     _HIGH, _TIPTOE = 0.05, np.radians(52.0)
-    """Height of a swinging foot, metres, and its pitch when it leaves the floor, for long steps."""
+    """For long steps: height of a swinging foot, metres, and its pitch at lift-off."""
 
     def __init__(
         self,
@@ -112,7 +112,7 @@ class Steps:
     ) -> None:
         swing = self._SWING * step_s
         starts = np.arange(begin, end, step_s)
-        # in the middle of the stance that follows
+        # at the middle of the following stance
         toes, heading = _footprints(person, *path(np.concatenate([[0.0], starts + 0.5 * swing + step_s])))
         where = np.concatenate([toes[..., :2], heading[..., None]], axis=-1)
         self._height = person.toe_height
@@ -134,7 +134,7 @@ class Steps:
             self._pitch[side].move(float(start) + 0.15 * swing, 0.7 * swing, np.zeros(1))
 
     def at(self, times: FloatArray) -> Feet:
-        """Where the feet are at (n,) seconds."""
+        """The feet at (n,) seconds."""
         where = np.stack([moves.at(times) for moves in self._moves], axis=1)
         pitch = np.concatenate([pitch.at(times) for pitch in self._pitch], axis=1)
         up = np.zeros((len(times), 2))

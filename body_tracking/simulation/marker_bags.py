@@ -1,6 +1,6 @@
-"""``body_tracking markers render``: images of a simulated arm with targets, as a bag, and the setup to track them.
+"""``body_tracking markers render``: images of a simulated arm with targets as a bag, and the setup to track them.
 
-Also the recording of images that is shipped, ``bags/markers_arm``, and its setup, ``config/marker_setup``.
+Also writes the shipped recording of images, ``bags/markers_arm``, and its setup, ``config/marker_setup``.
 """
 
 from __future__ import annotations
@@ -40,20 +40,20 @@ from body_tracking.simulation.repertoire import MOTIONS
 START_NS = 1_750_000_000 * NANOSECONDS
 TRUE_ANGLES = graph.true_angles_topic(setup.BODY)
 COLUMNS, ROWS, SQUARE = 9, 6, 0.04
-"""Of the chessboard: inner corners, and metres."""
+"""Chessboard: inner corners per row and column, and width of a square, metres."""
 WAND: Final = (0.0, 0.1, 0.3)
-"""Places of the balls along the wand, metres."""
+"""Positions of the balls along the wand, metres."""
 SHIPPED: Final = "markers_arm"
 """The recording of images in ``bags/``."""
 DARK: Final = Sensor(background=0.0, read_noise=0.0008)
-"""The sensor of the shipped images: 62 dB from the read noise to saturation, as data sheets of global shutter sensors
-have it, and a filter that leaves no light but the balls'. Most dark pixels are 0 then, and the images compress to a
-thirtieth; with the noise of :class:`Sensor` itself they compress to a fifth."""
+"""The sensor of the shipped images: 62 dB from read noise to saturation, as in data sheets of global shutter sensors,
+and a filter that passes only the balls' light. Most dark pixels are then 0, and the images compress to a thirtieth;
+with the noise of :class:`Sensor` itself they compress to a fifth."""
 SEED, _MOTION = 10, "random"
-"""A motion that turns all joints about all their axes, no angle near where it is not determined."""
+"""A motion that turns all joints about all their axes, with no angle near a singularity."""
 _RATE, FIT_RATE = 30.0, 15.0
 _START, _SECONDS, FIT_SECONDS = 15.0, 5.0, 14.0
-"""The joints are fitted to the beginning of the motion, the recording is what follows later."""
+"""Seconds: the joints are fitted to the beginning of the motion, the recording is a later part."""
 _BOARDS: Final = 16
 
 
@@ -105,13 +105,13 @@ def images(scene: MarkerScene, index: int, sensor: Sensor, seed: int) -> list[Im
 
 
 class RenderedImages:
-    """The images of the shipped recording's motion, rendered when they are asked for first (0.2 s a pair).
+    """The images of the shipped recording's motion, rendered on first request (0.2 s per pair) and cached.
 
     Args:
-        frames: of the cameras of a rig.
+        frames: of a rig's cameras.
 
     Raises:
-        RenderingError: they are not those of the scene.
+        RenderingError: the frames are not those of the scene.
     """
 
     unpaired = 0
@@ -147,7 +147,7 @@ def _angles(stamp_ns: int, frame_id: str, names: tuple[str, ...], angles: FloatA
 
 
 def board_images(rig: Rig, count: int, seed: int, sensor: Sensor | None = None) -> Iterator[list[Image]]:
-    """An image of each camera of a chessboard that is held in ``count`` poses before the rig."""
+    """Images, one per camera, of a chessboard in ``count`` poses in front of the rig."""
     rng = np.random.default_rng([seed, 1999])
     size = np.array([(COLUMNS - 1) * SQUARE, (ROWS - 1) * SQUARE, 0.0])
     for number in range(count):
@@ -169,7 +169,7 @@ def board_images(rig: Rig, count: int, seed: int, sensor: Sensor | None = None) 
 
 
 def write_boards(rig: Rig, folder: Path, count: int, seed: int) -> None:
-    """Write images of a chessboard, held in ``count`` poses before the rig, a folder per camera."""
+    """Write images of a chessboard in ``count`` poses in front of the rig, one folder per camera."""
     names = [setup.camera_name(camera.frame_id) for camera in rig.cameras]
     for name in names:
         (folder / name).mkdir(parents=True, exist_ok=True)
@@ -179,7 +179,7 @@ def write_boards(rig: Rig, folder: Path, count: int, seed: int) -> None:
 
 
 def wand_places(count: int, seed: int) -> FloatArray:
-    """(n, 3, 3) the balls of a wand that is held in ``count`` poses before the rig, metres in its frame."""
+    """(n, 3, 3) balls of a wand in ``count`` poses in front of the rig, metres in its frame."""
     rng = np.random.default_rng([seed, 450])
     middle = rng.uniform([0.0, -0.2, 0.9], [0.2, 0.2, 1.5], (count, 3))
     along = rng.normal(0.0, [1.0, 1.0, 0.5], (count, 3))
@@ -188,7 +188,7 @@ def wand_places(count: int, seed: int) -> FloatArray:
 
 
 def write_wand(rig: Rig, output: Path, count: int, seed: int, *, overwrite: bool = False) -> None:
-    """Write a recording of images of a wand, held in ``count`` poses before the rig.
+    """Write a recording of images of a wand in ``count`` poses in front of the rig.
 
     Raises:
         BagError: the folder exists and ``overwrite`` is false, or it cannot be written.
@@ -205,15 +205,15 @@ def write_wand(rig: Rig, output: Path, count: int, seed: int, *, overwrite: bool
 
 
 def shipped_scene() -> MarkerScene:
-    """The motion in the shipped recording."""
+    """The scene of the shipped recording."""
     return marker_scene(_MOTION, SEED, _RATE, _SECONDS, _START)
 
 
 def make_shipped(bags: Path, folder: Path) -> None:
     """Write the shipped recording of images, and the setup to track it, as a laboratory would make it.
 
-    The cameras are calibrated from rendered boards, the geometry of the targets is known as from a drawing, and the
-    joints are fitted to rendered images of an earlier part of the motion.
+    The cameras are calibrated from rendered boards, the targets' geometry is given as by a drawing, and the joints are
+    fitted to rendered images of an earlier part of the motion.
 
     Args:
         bags: folder of the recording :data:`SHIPPED`, which is replaced.
@@ -233,7 +233,7 @@ def make_setup(scene: MarkerScene, folder: Path, seed: int, joints: Sequence[Joi
     """Calibrate the cameras of a scene from rendered boards, and fit the joints to its motion.
 
     Args:
-        scene: its targets, whose geometry is known, move all joints.
+        scene: all joints move; the targets' geometry is known.
         folder: of the setup, whose files are replaced.
         seed: of the boards and of the images' noise.
         joints: between the targets.

@@ -1,8 +1,8 @@
-"""A simulated person with targets on shoulder, upper arm and forearm before a stereo rig of infrared cameras.
+"""A simulated person with targets on shoulder, upper arm and forearm in front of a stereo rig of infrared cameras.
 
-The geometry is that of Gaschler (2011), chapter 6: focal length 834 pixels, 0.48 m apart, turned towards each other
-by 13 degrees, targets of 98 mm. The shoulder is a ball joint between its target, which moves with the clavicle, and the
-upper arm; the elbow a universal joint: flexion, then pronation.
+Geometry of Gaschler (2011), chapter 6: focal length 834 pixels, baseline 0.48 m, toed in by 13 degrees, targets of 98
+mm. The shoulder is a ball joint between its target, which moves with the clavicle, and the upper arm; the elbow is a
+universal joint: flexion, then pronation.
 """
 
 from __future__ import annotations
@@ -29,28 +29,28 @@ APART, TOED_IN = 0.48, np.radians(13.0)
 DIAMETER: Final = 0.014
 EXTENT: Final = 0.098
 SEGMENTS: Final = {"shoulder": "clavicle_left", "upper_arm": "upper_arm_left", "forearm": "forearm_left"}
-"""The segment that carries each target."""
+"""Segment of each target."""
 JOINTS: Final = (
     JointDescription("shoulder", "shoulder", "upper_arm", JointKind.BALL),
     JointDescription("elbow", "upper_arm", "forearm", JointKind.UNIVERSAL),
 )
-"""Between the targets."""
+"""Joints between the targets."""
 _MOUNTS: Final = {"shoulder": (0.03, 0.10, 0.05), "upper_arm": (0.03, 0.06, -0.14), "forearm": (0.03, 0.05, -0.13)}
-"""Where on its segment, metres: x forward, y to the left, z up, while the arm hangs."""
+"""Position of each target on its segment, metres: x forward, y left, z up for a hanging arm."""
 _TRIALS: Final = 2000
 _APART: Final = 2.0 * DIAMETER
-"""Metres between the centres of two balls of a target, at least."""
+"""Least distance between the centres of two balls of a target, metres."""
 _AWAY: Final = 1.7
-"""Metres from the rig to the middle of the arm."""
+"""Distance from the rig to the middle of the arm, metres."""
 _FLEXION, _PRONATION = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, -1.0])
 """Axes of the elbow in the upper arm's segment and in the forearm's (:mod:`body_tracking.kinematics.upper_body`)."""
 _EXACT: Final = 1e-6
-"""Standard deviation of a true pose, metres and radians: a covariance has to be positive definite."""
+"""Standard deviation of a true pose, metres and radians; a covariance must be positive definite."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MarkerScene:
-    """What happens before the rig.
+    """True motion of targets in front of the rig.
 
     Attributes:
         rig: of two cameras; its frame is that of the left one.
@@ -82,7 +82,7 @@ class MarkerScene:
         )
 
     def poses(self, index: int, stamp_ns: int) -> list[TargetPose]:
-        """The true poses of all targets at one time, without noise but for :data:`_EXACT`."""
+        """The true poses of all targets at one time, with the covariance of :data:`_EXACT`."""
         return [
             TargetPose(
                 target.name,
@@ -111,13 +111,13 @@ class MarkerScene:
 
 
 def stereo_rig() -> Rig:
-    """The rig."""
+    """The stereo rig."""
     matrix = np.array([[FOCAL, 0.0, WIDTH / 2.0 - 0.5], [0.0, FOCAL, HEIGHT / 2.0 - 0.5], [0.0, 0.0, 1.0]])
     cameras = tuple(
         Camera(f"{name}_optical_frame", WIDTH, HEIGHT, matrix, np.array([-0.1, 0.0, 0.0, 0.0, 0.0]))
         for name in ("left", "right")
     )
-    # the right camera stands on the left one's +x, turned about y towards it
+    # the right camera is on the left one's +x side, rotated about y towards it
     turn = so3.quat_to_matrix(so3.exp(np.array([0.0, TOED_IN, 0.0])))
     middle = np.array([APART * np.cos(TOED_IN / 2.0), 0.0, -APART * np.sin(TOED_IN / 2.0)])
     rig = Rig(cameras, np.stack([np.eye(3), turn]), np.stack([np.zeros(3), -turn @ middle]), np.zeros((30, 30)))
@@ -125,7 +125,7 @@ def stereo_rig() -> Rig:
 
 
 def make_targets() -> tuple[Target, ...]:
-    """Targets of five balls each, no two alike: the best of some random ones."""
+    """Distinguishable targets of five balls each: the best of random ones."""
     rng = np.random.default_rng(0)
     found: list[Target] = []
     for name in SEGMENTS:
@@ -133,7 +133,7 @@ def make_targets() -> tuple[Target, ...]:
         drawn *= (EXTENT / _distances(drawn).max(axis=1))[:, None, None]
         own = _distances(drawn)
         others = np.hstack([own, *(np.tile(_distances(each.points), (_TRIALS, 1)) for each in found)])
-        # distances within a target far from each other, those of different targets less so
+        # distances within a target must differ most, distances of different targets less
         smallest = (np.diff(np.sort(each, axis=1)).min(axis=1) for each in (own, others))
         worth = np.minimum(next(smallest) / 0.002, next(smallest) / 3e-4)
         best = drawn[np.where(own.min(axis=1) < _APART, 0.0, worth).argmax()]
@@ -142,7 +142,7 @@ def make_targets() -> tuple[Target, ...]:
 
 
 def _distances(points: FloatArray) -> FloatArray:
-    """(..., 10) between five points (..., 5, 3), metres."""
+    """(..., 10) distances between five points (..., 5, 3), metres."""
     first, second = np.triu_indices(5, 1)
     apart: FloatArray = np.linalg.norm(points[..., first, :] - points[..., second, :], axis=-1)
     return apart
@@ -151,14 +151,14 @@ def _distances(points: FloatArray) -> FloatArray:
 def marker_scene(
     motion: str = "reaching", seed: int = 0, rate: float = 60.0, seconds: float = 20.0, start: float | None = None
 ) -> MarkerScene:
-    """A person, drawn by the seed, who moves before the rig.
+    """A person, drawn by the seed, who moves in front of the rig.
 
     Args:
         motion: of the repertoire.
-        seed: of the person and the manner.
-        rate: images a second.
+        seed: of the person and their manner.
+        rate: images per second.
         seconds: of the motion.
-        start: seconds of the motion that are left out before; None takes its middle.
+        start: seconds of the motion to skip; None takes its middle.
     """
     rng = np.random.default_rng([seed, 20110215])
     person = Person.draw(rng)
@@ -169,14 +169,14 @@ def marker_scene(
 
 
 def scene_of(person: Person, course: Course, seed: int) -> MarkerScene:
-    """A person who moves before the rig, the left arm in the middle of its view.
+    """A person who moves in front of the rig, with the left arm in the middle of its view.
 
     Args:
         person: the body.
         course: its motion in the person's own frame, which the rig faces.
-        seed: of how the targets are worn.
+        seed: of the targets' orientations on the segments.
     """
-    # the same in all motions of a person, so that joints fitted to one serve for the others
+    # constant over all motions of a person, so that joints fitted to one motion are valid for others
     worn = so3.quat_to_matrix(so3.exp(np.random.default_rng([seed, 98]).normal(0.0, 0.3, (len(SEGMENTS), 3))))
     posture = MODEL.forward(course.q, person.lengths)
     indices = [MODEL.segment_names.index(segment) for segment in SEGMENTS.values()]
@@ -198,7 +198,7 @@ def scene_of(person: Person, course: Course, seed: int) -> MarkerScene:
 
 
 def _true_chain(rotations: FloatArray, translations: FloatArray, origins: FloatArray, worn: FloatArray) -> Chain:
-    """The joints, by poses (3, ...) of the targets and origins (3, 3) of their segments, which are the joints' centres.
+    """The joints from the targets' poses (3, ...) and their segments' origins (3, 3), which are the joint centres.
 
     ``worn``: (3, 3, 3) rotations of the targets in their segments.
     """

@@ -1,7 +1,7 @@
-"""People of the simulator: bodies from anthropometric tables, their configuration over time, and their joints.
+"""People of the simulator: bodies from anthropometric tables, their configurations over time, and their joints.
 
-A body is that of ``upper_body`` on two legs. The legs hang on the hips and stand on ankles that a motion places; a knee
-follows from the lengths of thigh and shank. Sources: stature, mass and breadths by Gordon et al., "2012 anthropometric
+A body is that of ``upper_body`` on two legs. The legs connect the hips with ankles placed by the motion; the knees
+follow from the lengths of thigh and shank. Sources: stature, mass and breadths by Gordon et al., "2012 anthropometric
 survey of U.S. Army personnel" (ANSUR II), Natick/TR-15/007 (2014); lengths as shares of the stature by Drillis and
 Contini (1966), in Winter, "Biomechanics and motor control of human movement" (2009), figure 4.1; masses of the segments
 by de Leva, J. Biomech. 29 (1996) 1223, table 4.
@@ -25,7 +25,7 @@ MODEL: Final = UpperBody()
 
 
 class PeopleError(BodyTrackingError):
-    """Raised when an ankle is out of the leg's reach."""
+    """Raised if an ankle is out of the leg's reach."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,9 +35,9 @@ class _Table:
     Attributes:
         stature: metres, mean and standard deviation.
         body_mass_index: kg/m^2, median; ``spread`` is its coefficient of variation.
-        shoulders, hips: breadth as a share of the stature, against the average of both sexes (biacromial breadth
+        shoulders, hips: breadth as a share of the stature, relative to the mean of both sexes (biacromial breadth
             415.7 mm of 1755.8 mm and 365.3 mm of 1628.5 mm; hip breadth alike).
-        masses: of head, trunk, and one upper arm, forearm, hand, thigh, shank and foot, as shares of the whole.
+        masses: of head, trunk, and one upper arm, forearm, hand, thigh, shank and foot, as shares of the body mass.
     """
 
     stature: tuple[float, float]
@@ -69,21 +69,21 @@ _TABLES: dict[str, _Table] = {
 }
 SEXES: tuple[str, ...] = tuple(_TABLES)
 _TAIL = 2.5
-"""Standard deviations within which people are drawn."""
+"""Standard deviations at which drawn people are clipped."""
 
 # shares of the stature, the last one from the ankle to the FOOT point
 _THIGH, _SHANK, _ANKLE_HEIGHT, _FOOT = 0.245, 0.246, 0.039, 0.093
 _TOE_HEIGHT = 0.4
-"""Of the FOOT point over the floor, where the sole is flat on it, as a share of the ankle's."""
+"""Height of the FOOT point above the floor for a flat sole, as a share of the ankle's."""
 _UPRIGHT = ("lower_trunk", "upper_trunk", "neck", "head", "hip_drop")
-"""Lengths that add up to the stature, together with the legs."""
+"""Lengths that add up to the stature with those of the legs."""
 _PROPORTION_STDDEV = 0.04
-"""Of a length, given the stature."""
+"""Relative standard deviation of a length, given the stature."""
 _ASYMMETRY_STDDEV = 0.008
-"""Of left against right."""
+"""Relative standard deviation between left and right."""
 
 _DENSITY = 1060.0
-"""kg/m^3 of flesh and bone together (Winter 2009, table 4.1: 0.9 of the trunk to 1.1 of the limbs)."""
+"""kg/m^3, mean density of flesh and bone (Winter 2009, table 4.1: 0.9 of the trunk to 1.1 of the limbs)."""
 _TRUNK_ASPECT = 1.5
 """Breadth over depth of the trunk."""
 _SKULL = 0.062
@@ -98,9 +98,9 @@ class Person:
         sex: ``female`` or ``male``.
         stature: metres.
         mass: kilograms.
-        lengths: (21,) metres, as ``UpperBody.length_names``, between the joint centres that a Kinect v2 shows.
+        lengths: (21,) metres, as ``UpperBody.length_names``, between the joint centres of a Kinect v2.
         thigh, shank: (2,) metres, left and right.
-        ankle_height: metres, of the ankle joints over the soles.
+        ankle_height: metres, of the ankle joints above the soles.
         foot: metres from an ankle to the FOOT point.
     """
 
@@ -115,17 +115,17 @@ class Person:
 
     @classmethod
     def average(cls, sex: str) -> Person:
-        """The average person of a sex, left and right alike."""
+        """The average person of a sex, with equal left and right."""
         table = _TABLES[sex]
         stature = table.stature[0]
         return cls._of(sex, stature, table.body_mass_index * stature**2, {}, {})
 
     @classmethod
     def draw(cls, rng: np.random.Generator, sex: str | None = None) -> Person:
-        """Draw a person of a sex, or of any: stature and build by the tables, proportions 4 % off the average.
+        """Draw a person: stature and build by the tables, proportions with a standard deviation of 4 %.
 
-        The body mass index is lognormal; all deviations are clipped to 2.5 standard deviations. The upright lengths
-        are scaled so that they add up to the stature.
+        Without ``sex`` it is drawn, too. The body mass index is lognormal; all deviations are clipped to 2.5 standard
+        deviations. The upright lengths are scaled to add up to the stature.
         """
         chosen = sex if sex is not None else SEXES[rng.integers(len(SEXES))]
         table = _TABLES[chosen]
@@ -151,7 +151,7 @@ class Person:
             side = 0.5 * (name.endswith("_left") - name.endswith("_right"))
             lengths[number] *= breadths.get(kind, 1.0) * factors.get(kind, 1.0) * (1.0 + side * apart.get(kind, 0.0))
         sides = np.array([0.5, -0.5])
-        # legs differ less from each other than arms do: half
+        # the asymmetry of legs is half that of arms
         thigh, shank = (
             share * stature * factors.get(kind, 1.0) * (1.0 + 0.5 * sides * apart.get(kind, 0.0))
             for kind, share in (("thigh", _THIGH), ("shank", _SHANK))
@@ -172,11 +172,11 @@ class Person:
 
     @property
     def toe_height(self) -> float:
-        """Metres of the FOOT points over the soles."""
+        """Height of the FOOT points above the soles, metres."""
         return _TOE_HEIGHT * self.ankle_height
 
     def length(self, name: str) -> float:
-        """Metres of one of ``UpperBody.length_names``."""
+        """One of ``UpperBody.length_names``, metres."""
         return float(self.lengths[MODEL.length_names.index(name)])
 
     def capsules(self) -> Capsules:
@@ -184,7 +184,7 @@ class Person:
         masses = _TABLES[self.sex].masses
         trunk = self.length("lower_trunk") + self.length("upper_trunk")
         depth = _radius(masses["trunk"] * self.mass / _TRUNK_ASPECT, trunk)
-        # heads grow less than in proportion to the mass
+        # heads grow less than proportionally to the body mass
         skull = 0.5 * (_ball(masses["head"] * self.mass) + _SKULL * self.stature)
         parts: list[tuple[Joint, Joint, float]] = [
             (Joint.HEAD, Joint.HEAD, skull),
@@ -199,7 +199,7 @@ class Person:
             arm = _radius(masses["upper_arm"] * self.mass, upper_arm)
             palm = _radius(masses["hand"] * self.mass, 1.6 * hand)
             parts += [
-                # the flanks, which make the trunk broader than deep
+                # the flanks, which widen the trunk
                 (joint["SHOULDER"], joint["HIP"], 0.75 * depth),
                 (Joint.SPINE_SHOULDER, joint["SHOULDER"], 1.2 * arm),
                 (joint["SHOULDER"], joint["ELBOW"], arm),
@@ -222,9 +222,9 @@ _LEGS = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Course:
-    """A body's configurations and feet at n instants, in one frame.
+    """Configurations of a body and positions of its feet at n instants, in one frame.
 
-    A person's own frame has its origin on the floor between the initial places of the feet, x forward, z up.
+    A person's own frame has its origin on the floor between the initial positions of the feet, x forward, z up.
 
     Attributes:
         times: (n,) seconds.
@@ -239,7 +239,7 @@ class Course:
     toes: FloatArray
 
     def placed(self, position: FloatArray, yaw: float) -> Course:
-        """Transformed into a frame in which this frame's origin is at (3,) metres, with a yaw in radians."""
+        """The course in a frame in which this frame's origin is at (3,) metres, with a yaw in radians."""
         turn = so3.exp(np.array([0.0, 0.0, yaw]))
         matrix = so3.quat_to_matrix(turn)
         q = self.q.copy()
@@ -250,13 +250,13 @@ class Course:
 
 
 def joints(person: Person, course: Course) -> FloatArray:
-    """The 25 joints.
+    """The 25 joints of a course.
 
     Returns:
         (n, 25, 3) metres in the course's frame, in the order of :class:`~body_tracking.core.skeleton.Joint`.
 
     Raises:
-        PeopleError: an ankle is further from its hip than the leg is long.
+        PeopleError: an ankle is farther from its hip than the leg is long.
     """
     posture = MODEL.forward(course.q, person.lengths)
     result = np.empty((len(course.times), N_JOINTS, 3))
@@ -268,10 +268,10 @@ def joints(person: Person, course: Course) -> FloatArray:
 
 
 def _forward(course: Course, pelvis: FloatArray) -> FloatArray:
-    """(n, 2, 3) directions in which the knees bend: halfway between those of pelvis and foot, horizontal."""
+    """(n, 2, 3) horizontal directions in which the knees bend: halfway between those of pelvis and foot."""
     feet = (course.toes - course.ankles) * [1.0, 1.0, 0.0]
     feet /= np.linalg.norm(feet, axis=-1, keepdims=True)
-    # the pelvis' left axis, turned by 90 degrees: its x axis is vertical when the person bends down
+    # the pelvis' left axis, turned by 90 degrees: its x axis is vertical for a person bent down
     left = pelvis[:, None, :, 1]
     ahead = np.stack([left[..., 1], -left[..., 0], np.zeros_like(left[..., 0])], axis=-1)
     result: FloatArray = feet + ahead / np.linalg.norm(ahead, axis=-1, keepdims=True)
@@ -279,7 +279,7 @@ def _forward(course: Course, pelvis: FloatArray) -> FloatArray:
 
 
 def _knees(person: Person, hips: FloatArray, ankles: FloatArray, forward: FloatArray) -> FloatArray:
-    """(n, 2, 3) the knees between hips and ankles, by the law of cosines, bent towards ``forward``."""
+    """(n, 2, 3) knees between hips and ankles, by the law of cosines, bent towards ``forward``."""
     leg = ankles - hips
     distance = np.linalg.norm(leg, axis=-1)
     too_far = distance > person.legs + 1e-9
@@ -304,10 +304,10 @@ def _kind(name: str) -> str:
 
 
 def _radius(mass: float, length: float) -> float:
-    """Metres, of a cylinder."""
+    """Radius of a cylinder of this mass and length, metres."""
     return float(np.sqrt(mass / (_DENSITY * np.pi * length)))
 
 
 def _ball(mass: float) -> float:
-    """Metres."""
+    """Radius of a sphere of this mass, metres."""
     return float(np.cbrt(0.75 * mass / (_DENSITY * np.pi)))

@@ -1,10 +1,10 @@
 """Postures in clinical angles, and their conversion to configurations of the body model.
 
-A posture gives the direction of an upper arm against the chest (elevation, and its plane: 0 sideways, 90 forward), its
-twist relative to the shortest rotation there from hanging, and the bend and rotation of the whole trunk. Shoulder
-girdle and spine share these: a clavicle rises by a third of the arm's elevation beyond 30 degrees (Inman et al., J.
-Bone Joint Surg. 26 (1944) 1) and protracts with the arm; lumbar and thoracic joints divide a bend by their ranges.
-Close to a limit of ``kinematics.ranges``, angles are compressed so that none exceeds it.
+A posture gives the direction of an upper arm relative to the chest (elevation, and its plane: 0 sideways, 90 forward),
+its twist relative to the shortest rotation from hanging, and the bend and rotation of the whole trunk. They are
+distributed over shoulder girdle and spine: a clavicle rises by a third of the arm's elevation beyond 30 degrees (Inman
+et al., J. Bone Joint Surg. 26 (1944) 1) and protracts with the arm; lumbar and thoracic joints share a bend in
+proportion to their ranges. Close to a limit of ``kinematics.ranges``, angles are compressed so that none exceeds it.
 """
 
 from __future__ import annotations
@@ -45,15 +45,15 @@ SIDED = (
     "heel",
     "pivot",
 )
-"""Shrug and reach are elevation and protraction of a clavicle beyond its share of the arm's elevation; a swing moves an
-arm forward whatever its plane; a twist is inwards; a heel rises about the toes; a foot pivots on them inwards."""
+"""Shrug and reach: elevation and protraction of a clavicle beyond its share of the arm's elevation. Swing: moves an arm
+forward in any plane. Twist: inwards. Heel: rises about the toes. Pivot: of a foot on its toes, inwards."""
 NAMES: Final = (*_MIDDLE, *(f"{name}_{side}" for name in SIDED for side in ("left", "right")))
-"""Degrees, with the signs of the model's angles; ``forward``, ``left`` and ``drop`` displace the pelvis from its place
-above standing feet, as shares of the length of the legs."""
+"""Degrees, with the signs of the model's angles; ``forward``, ``left`` and ``drop`` displace the pelvis relative to
+standing feet, as shares of the length of the legs."""
 
 
 def posture(**quantities: float) -> FloatArray:
-    """(35,) a posture; a name without its side sets both sides, a missing name is 0."""
+    """(35,) a posture; a name without a side sets both sides; missing names are 0."""
     result = np.zeros(len(NAMES))
     for name, value in quantities.items():
         result[at(name)] = value
@@ -61,7 +61,7 @@ def posture(**quantities: float) -> FloatArray:
 
 
 def at(name: str) -> IntArray:
-    """Indices of a quantity in a posture: left and right, or one."""
+    """Indices of a quantity in a posture: left and right, or a single one."""
     both = (f"{name}_left", f"{name}_right") if name in SIDED else (name,)
     return np.array([NAMES.index(one) for one in both], dtype=np.intp)
 
@@ -89,19 +89,19 @@ PELVIS_QUATERNION: Final = MODEL.quaternion_of("pelvis")
 FROM_CENTRE: Final = so3.quat_inverse(
     so3.exp(np.stack([_RANGES.soft_coordinates(MODEL.neutral()).values[start : start + 3] for start in _SHOULDERS]))
 )
-"""(2, 4) the upper arms at the centres of their reach, in the clavicles' frames."""
+"""(2, 4) orientations of the upper arms at the centres of their reach, in the clavicles' frames."""
 
 _SPINE_SHARES = {"flexion": 0.58, "lateral": 0.5, "axial": 0.3}
-"""The lumbar joint's share of a bend; the rest is thoracic. In proportion to their ranges."""
+"""The lumbar joint's share of a bend, in proportion to the ranges; the rest is thoracic."""
 _RHYTHM = 1.0 / 3.0
 _RHYTHM_FROM, _RHYTHM_SOFTNESS = 30.0, 8.0
-"""Degrees of an arm's elevation from which the clavicle rises, and how gradually it begins to."""
+"""Degrees of an arm's elevation at which the clavicle starts to rise, and width of the smooth transition."""
 _CLAVICLE_REST = -10.0
-"""Degrees of elevation: a Kinect's shoulder points hang below its SpineShoulder."""
+"""Degrees of elevation: a Kinect's shoulder points lie below its SpineShoulder."""
 _PROTRACTION = 14.0
-"""Degrees by which a clavicle comes forward with an arm that points forward."""
+"""Degrees of a clavicle's protraction for an arm that points forward."""
 _ROOM = 0.9
-"""Share of half a range up to which an angle is unchanged; beyond, it is compressed."""
+"""Share of half a range up to which an angle is unchanged; larger angles are compressed."""
 
 
 def _bounded(share: FloatArray) -> FloatArray:

@@ -1,9 +1,9 @@
 """Random people with random motions, their ground truth, and white-noise measurements of them.
 
 Test data for the filters of the body model: everything obeys the model (``upper_body`` with its ranges of motion), so
-that every error is the filter's. The caller passes a seeded generator. A motion is a closed function of time: phases of
-rest and activity, in which trunk, neck, arms and base make minimum-jerk moves (Flash and Hogan 1985) between random
-postures, with slow waves (0.05 to 0.8 Hz) added. Every angle stays inside its range at every instant.
+all errors are the filter's. The caller passes a seeded generator. A motion is a closed function of time: phases of rest
+and activity, in which trunk, neck, arms and base make minimum-jerk moves (Flash and Hogan 1985) between random
+postures, plus slow waves (0.05 to 0.8 Hz). Every angle stays inside its range at every instant.
 """
 
 from __future__ import annotations
@@ -34,34 +34,34 @@ _RANGES: Final = Ranges(MODEL)
 _NAMES: Final = MODEL.coordinate_names[6:]
 _CENTRE: Final = _RANGES.centre
 _HALF: Final = 0.5 * (_RANGES.high - _RANGES.low)
-"""(26,) centres and half widths of the ranges; postures are drawn as shares u, coordinate = centre + half u."""
+"""(26,) centres and half widths of the ranges; postures are drawn as shares u: coordinate = centre + half u."""
 
 START_NS = 1_000 * NANOSECONDS
 """Stamp of time 0."""
 
 STATURES = (1.5, 2.0)
-"""Metres: least and greatest."""
+"""Least and greatest stature, metres."""
 _PROPORTION_STDDEV = 0.06
 _ASYMMETRY = (0.01, 0.02)
-"""Difference of left and right, as a share of the length."""
+"""Range of the relative difference between left and right."""
 
 TEMPI = (0.4, 1.6)
-"""Calm and brisk: greatest angular rates of a move are those below times this, shortest durations divided by it."""
+"""Range from calm to brisk: factor on the greatest angular rates of moves, and divisor of the shortest durations."""
 _TRUNK_RATE, _NECK_RATE, _ARM_RATE = np.radians([100.0, 150.0, 200.0])
 _PEAK_OF_MEAN = 1.875
-"""Peak over mean velocity of a minimum-jerk move."""
+"""Ratio of peak to mean velocity of a minimum-jerk move."""
 _SHORTEST_MOVE = np.radians(90.0)
-"""Shortest duration of a move, seconds, times its greatest rate: 0.9 s of the trunk, 0.45 s of an arm."""
+"""Shortest duration of a move, seconds, times its greatest rate: 0.9 s for the trunk, 0.45 s for an arm."""
 
 _WAVE_SHARE = 0.25
-"""Amplitude of the waves as a share of half the range, in its middle; at its ends there are none."""
+"""Amplitude of the waves in the middle of a range, as a share of its half width; it falls to 0 at the ends."""
 _RESTLESSNESS = 0.04
 """Share of the waves that remains at rest."""
 
 _SWAY = np.array([0.006, 0.006, 0.002, *np.radians([1.0, 1.0, 1.5])])
-"""Amplitude of a standing person's base: metres, then radians about its own axes."""
+"""Sway amplitude of a standing person's base: metres, then radians about its own axes."""
 _PELVIS = np.radians([4.0, 6.0, 0.0])
-"""Amplitude of an active person's additional tilt of the pelvis."""
+"""Amplitude of the additional pelvic tilt of an active person."""
 
 _DIRECTIONS = {
     "arms_up": (0.0, 0.0, 1.0),
@@ -69,7 +69,7 @@ _DIRECTIONS = {
     "arms_forward": (1.0, 0.0, 0.0),
     "t_pose": (0.0, 1.0, 0.0),
 }
-"""Direction of the left arm in special postures, the right one mirrored: straight arms, upright trunk."""
+"""Direction of the left arm in special postures with straight arms and upright trunk; the right arm is mirrored."""
 POSTURES: Final = tuple(_DIRECTIONS)
 
 
@@ -88,7 +88,7 @@ _SHOULDERS = np.stack([_indices("shoulder", end=side) for side in ("_left", "_ri
 _HANGING: Final = _RANGES.soft_coordinates(MODEL.neutral()).values[_SHOULDERS]
 """(2, 3) rotation vectors of hanging arms from the centres of their reach."""
 _MIRROR_ARM = np.array([1.0, 1.0, -1.0, 1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
-"""A left arm's shares to the right arm's: only the rotation vector of the shoulder changes signs."""
+"""Factors from a left arm's shares to a right arm's: only the shoulder's rotation vector changes signs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,7 +105,7 @@ class RandomPerson:
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> RandomPerson:
-        """A person of 1.5 to 2.0 m whose proportions are 6 % off the average, and left and right 1 to 2 % apart."""
+        """A person of 1.5 to 2.0 m with 6 % standard deviation of proportions, left and right 1 to 2 % different."""
         stature = rng.uniform(*STATURES)
         lengths = MODEL.default_lengths(stature)
         kinds = [name.removesuffix("_left").removesuffix("_right") for name in MODEL.length_names]
@@ -118,7 +118,7 @@ class RandomPerson:
 
 
 def _share(degrees: FloatArray, where: IntArray) -> FloatArray:
-    """Angles to shares of the half ranges, not beyond 95 % of them."""
+    """Angles in degrees as shares of the half ranges, clipped to 95 % of them."""
     result: FloatArray = np.clip((np.radians(degrees) - _CENTRE[where]) / _HALF[where], -0.95, 0.95)
     return result
 
@@ -141,7 +141,7 @@ def _draw_neck(rng: np.random.Generator) -> FloatArray:
 
 
 def _draw_arm(rng: np.random.Generator) -> FloatArray:
-    """(9,) shares of a left arm: hanging, or anywhere in its reach."""
+    """(9,) shares of a left arm: hanging, or anywhere within its reach."""
     arm = _ARMS[0]
     if rng.random() < 0.25:
         shares = _share(
@@ -157,12 +157,12 @@ def _draw_arm(rng: np.random.Generator) -> FloatArray:
 
 
 def _draw_posture(rng: np.random.Generator, name: str) -> FloatArray:
-    """(26,) shares of a special posture: upright to 2 degrees, elbows straight to 3."""
+    """(26,) shares of a special posture: upright within 2 degrees, elbows straight within 3."""
     shares = _share(rng.normal(scale=2.0, size=len(_NAMES)), np.arange(len(_NAMES), dtype=np.intp))
     for side, arm in enumerate(_ARMS):
         direction = np.array(_DIRECTIONS[name]) * [1.0, 1.0 if side == 0 else -1.0, 1.0]
         centre = so3.quat_to_matrix(FROM_CENTRE[side])
-        # the shortest way from the centre of the reach, as a rotation vector in the upper arm's frame there
+        # the shortest rotation from the centre of the reach, as a rotation vector in the upper arm's frame there
         wanted = centre.T @ direction
         axis = np.cross([0.0, 0.0, -1.0], wanted)
         swing = np.arctan2(np.linalg.norm(axis), -wanted[2]) * axis / np.linalg.norm(axis)
@@ -176,10 +176,10 @@ class RandomMotion:
 
     Args:
         rng: random generator.
-        duration: seconds of motion; afterwards the person rests.
-        tempo: 0.4 calm to 1.6 brisk; drawn (log-uniformly) where it is None.
-        postures: special postures (:data:`POSTURES`) to take, in this order, each held for 1 to 2 s.
-        full_turns: how many full turns of the body to make at least.
+        duration: seconds of motion; the person rests afterwards.
+        tempo: 0.4 calm to 1.6 brisk; None draws it (log-uniformly).
+        postures: special postures (:data:`POSTURES`) to take in this order, each held for 1 to 2 s.
+        full_turns: least number of full turns of the body.
     """
 
     def __init__(
@@ -216,7 +216,8 @@ class RandomMotion:
         waves[:, _TWIST[0]] = 0.7 * waves[:, _TWIST[1]] + 0.3 * waves[:, _TWIST[0]]
         swing = _SHOULDERS[:, :2]
         waves[:, swing] /= np.sqrt(2.0)
-        # |u| + a (1 - u^2) <= 1 for |u| <= 1 and a <= 1/2, so that no angle leaves its range; a swing is one quantity
+        # |u| + a (1 - u^2) <= 1 for |u| <= 1 and a <= 1/2, so angles stay in range; a swing's two components count
+        # together
         room = 1.0 - goal**2
         room[:, swing] = 1.0 - (goal[:, swing] ** 2).sum(axis=-1, keepdims=True)
         soft = _CENTRE + _HALF * (goal + _WAVE_SHARE * activity * waves * room)
@@ -235,12 +236,12 @@ class RandomMotion:
 
     @staticmethod
     def _draw_place(rng: np.random.Generator) -> FloatArray:
-        """(2,) metres on the floor: about 2 m in front of the reference sensor."""
+        """(2,) position on the floor, metres: about 2 m in front of the reference sensor."""
         radius, direction = 0.6 * np.sqrt(rng.random()), rng.uniform(0.0, 2.0 * np.pi)
         return np.array([2.0 + radius * np.cos(direction), radius * np.sin(direction)])
 
     def _reach(self, course: Moves, begin: float, target: FloatArray, slower: float) -> None:
-        """A move as fast as the tempo allows, or slower by a factor."""
+        """Add a move as fast as the tempo allows, or slower by a factor."""
         way = float(np.abs((target - course.target) * course.half).max())
         course.move(begin, slower * max(_PEAK_OF_MEAN * way, _SHORTEST_MOVE) / (course.rate * self.tempo), target)
 
@@ -261,7 +262,7 @@ class RandomMotion:
             time = max(time, self._base.end) + rng.uniform(0.4, 1.6)
 
     def _act(self, rng: np.random.Generator, begin: float, end: float) -> float:
-        """Move trunk, neck and arms between two instants; returns when all have ended."""
+        """Move trunk, neck and arms between two instants; returns the time at which all moves have ended."""
         ramp = 0.5 / self.tempo
         self._activity.move(begin, ramp, np.ones(1))
         together = rng.random() < 0.35
@@ -287,7 +288,7 @@ class RandomMotion:
         return self._activity.end
 
     def _pose(self, rng: np.random.Generator, begin: float, name: str) -> float:
-        """Take a special posture; returns when it is reached."""
+        """Take a special posture; returns the time at which it is reached."""
         shares = _draw_posture(rng, name)
         slower = rng.uniform(1.0, 1.5)
         for course, where in ((self._trunk, _TRUNK), (self._neck, _NECK), *zip(self._arms, _ARMS, strict=True)):
@@ -295,7 +296,7 @@ class RandomMotion:
         return max(self._trunk.end, self._neck.end, *(arm.end for arm in self._arms))
 
     def _turn(self, rng: np.random.Generator, begin: float, full: bool) -> float:
-        """Turn on the spot; returns when the turn ends."""
+        """Turn on the spot; returns the time at which the turn ends."""
         angle = 2.0 * np.pi if full else np.radians(rng.uniform(30.0, 180.0))
         slowest = 3.5 if full else 0.8
         duration = max(slowest, angle / np.radians(120.0)) * rng.uniform(0.8, 1.4) / np.sqrt(self.tempo)
@@ -324,7 +325,7 @@ class Truth:
         velocity: (n, 32) tangent velocities, per second.
         lengths: (21,) metres.
         positions: (n, 19, 3) metres, ``UpperBody.joints`` in world.
-        speeds: (n, 19) metres per second of these points.
+        speeds: (n, 19) speeds of these points, m/s.
     """
 
     times: FloatArray
@@ -336,7 +337,7 @@ class Truth:
 
 
 def capture_times(duration: float, rng: np.random.Generator, rate: float = 30.0) -> FloatArray:
-    """(n,) seconds of a sensor's captures, ascending, at a rate in Hz and with a jitter of 1 ms."""
+    """(n,) capture times of a sensor in seconds, ascending, at a rate in Hz with a jitter of 1 ms."""
     times = np.arange(0.0, duration, 1.0 / rate)
     # stamps are whole nanoseconds
     moved = times + np.clip(rng.normal(scale=0.001, size=len(times)), -0.3 / rate, 0.3 / rate)
@@ -358,7 +359,7 @@ ARMS: Final[dict[str, tuple[Joint, ...]]] = {
     side: tuple(Joint[f"{part}_{side}"] for part in ("ELBOW", "WRIST", "HAND", "HAND_TIP", "THUMB"))
     for side in ("LEFT", "RIGHT")
 }
-"""The joints of an arm without the shoulder."""
+"""The joints of an arm except the shoulder."""
 EVERYTHING: Final = tuple(Joint)
 _LOSABLE: Final = (
     ARMS["LEFT"],
@@ -376,7 +377,7 @@ _LOSABLE: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Dropout:
-    """Joints that are not tracked from ``begin`` to ``end``, seconds."""
+    """Joints that are lost from ``begin`` to ``end``, seconds."""
 
     begin: float
     end: float
@@ -394,7 +395,7 @@ def draw_dropouts(
 
     Args:
         rng: random generator.
-        count: of dropouts.
+        count: number of dropouts.
         between: seconds within which they lie.
         longest: seconds; the shortest is 0.1 s.
         everything: probability that a dropout affects all joints.
@@ -419,12 +420,12 @@ class MeasurementErrors:
     """Errors of the measurements.
 
     Attributes:
-        noise: metres, standard deviation per axis of the white Gaussian noise.
-        factors: (25,) of the noise per joint, or None for 1.
+        noise: standard deviation per axis of the white Gaussian noise, metres.
+        factors: (25,) of the noise per joint; None for 1.
         dropouts: of joints.
         gaps: (begin, end) seconds without any frame.
         outliers: share of the joint samples that are displaced in a random direction.
-        outlier_size: metres, greatest displacement; uniform from 0.
+        outlier_size: largest displacement, metres; uniform from 0.
         outliers_between: seconds within which there are outliers.
     """
 
@@ -439,13 +440,13 @@ class MeasurementErrors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
-    """Measurements of n instants.
+    """Measurements at n instants.
 
     Attributes:
-        skeletons: of the frames that arrived, in frame ``world``.
-        frames: for each of them, the index of its instant in the truth.
-        seen: (n, 19) which points of the model were measured; none in a gap.
-        outlier: (n, 19) which of them are outliers.
+        skeletons: of the frames that arrived, in the frame ``world``.
+        frames: for each skeleton the index of its instant in the truth.
+        seen: (n, 19) whether a point of the model was measured; False in a gap.
+        outlier: (n, 19) whether the measurement is an outlier.
     """
 
     skeletons: tuple[Skeleton, ...]
@@ -455,7 +456,7 @@ class Observation:
 
 
 def observe(truth: Truth, errors: MeasurementErrors, rng: np.random.Generator) -> Observation:
-    """Skeletons without covariances; the joints of the legs, which the model lacks, are NOT_TRACKED."""
+    """Measure skeletons, without covariances; joints of the legs, which the model lacks, are NOT_TRACKED."""
     times, points = truth.times, MODEL.joints
     shape = (len(times), len(points))
     seen: BoolArray = np.ones(shape, dtype=np.bool_)

@@ -1,8 +1,8 @@
 """Motions of people: the thesis's test motions (Schlagenhauf 2017, 4.3.3-4.3.4, 5.6.1), others of daily life and
 exercise, and random ones.
 
-Every movement is a closed function of time with continuous accelerations, made of minimum-jerk moves, sinusoids that
-fade in and out, and slow sway.
+Every movement is a closed function of time with continuous accelerations, composed of minimum-jerk moves, sinusoids
+that fade in and out, and slow sway.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from body_tracking.simulation.random_people import RandomMotion
 TPOSE_S = 3.0
 """Seconds of T-pose at the beginning."""
 END_S = 1.5
-"""Seconds of T-pose at the end, at least."""
+"""Least duration of the T-pose at the end, seconds."""
 _ENTRY_S = 1.2
-"""Seconds from the T-pose to the first posture, and back."""
+"""Duration of the move from the T-pose to the first posture, and back, seconds."""
 _RAMP_S = 0.5
-"""Seconds in which a repeated motion fades in, and in which it fades out."""
+"""Duration of the fade-in and of the fade-out of a periodic motion, seconds."""
 
 
 class RepertoireError(BodyTrackingError):
@@ -73,13 +73,12 @@ class Movement:
 class _Manner:
     """A person's individual manner of performing a motion.
 
-    Attributes:
-        tempo: factor of all rates.
-        amplitude: (35,) factors of the motion's amplitudes.
-        habit: (35,) degrees and shares, constant offsets.
-        lag: (2,) seconds, delays of left and right.
-        restless: (35,) amplitudes of the sway.
-        waves, effort: the sway, and the variation between repetitions.
+    tempo: factor on all rates.
+    amplitude: (35,) factors on the motion's amplitudes.
+    habit: (35,) constant offsets, degrees and shares.
+    lag: (2,) delays of left and right, seconds.
+    restless: (35,) amplitudes of the sway.
+    waves, effort: time courses of the sway, and of the variation between repetitions.
     """
 
     tempo: float
@@ -92,7 +91,7 @@ class _Manner:
 
     @classmethod
     def of(cls, rng: np.random.Generator | None) -> _Manner:
-        """Draw a manner; without a generator that of the standard performance, which only sways."""
+        """Draw a manner; None for the standard performance, which only sways."""
         restless = posture(**{name: wave for name, (wave, _) in _MANNERS.items()})
         size = len(NAMES)
         if rng is None:
@@ -110,7 +109,7 @@ class _Manner:
         return cls(tempo, amplitude, habit, lag, restless, Waves(rng, size, 0.5), Waves(rng, 1, 0.4))
 
     def added(self, times: FloatArray) -> FloatArray:
-        """(n, 35) offsets and sway, to be added to the postures of a motion."""
+        """(n, 35) offsets and sway, added to the postures of a motion."""
         result: FloatArray = self.habit + self.restless * self.waves.at(times)
         return result
 
@@ -136,7 +135,7 @@ _MANNERS = {
     "wrist_flexion": (4.0, 5.0),
     "wrist_deviation": (2.0, 3.0),
 }
-"""Amplitude of the sway, and standard deviation of habits; degrees and shares of the legs."""
+"""Amplitude of the sway, and standard deviation of habits; degrees and shares of the legs' length."""
 
 
 def _perform(name: str, person: Person, manner: _Manner, exercise: Exercise, seconds: float | None) -> Movement:
@@ -187,7 +186,7 @@ def _stand(person: Person, times: FloatArray, postures: FloatArray) -> Course:
 def _compose(
     person: Person, times: FloatArray, postures: FloatArray, feet: Feet, places: FloatArray, yaw: FloatArray
 ) -> Course:
-    """Postures on feet; the postures displace the pelvis from its places (n, 2) and headings ``yaw`` (n,)."""
+    """Postures on feet; the postures displace the pelvis relative to positions (n, 2) and headings ``yaw`` (n,)."""
     turned = postures.copy()
     turned[:, at("pelvis_yaw")[0]] += np.degrees(yaw)
     q = configuration(turned)
@@ -216,7 +215,7 @@ def _standing_still(name: str, person: Person, rng: np.random.Generator | None, 
 
 
 _WALK_RATE = 0.85
-"""Metres per second, with legs of 0.86 m."""
+"""Walking speed with legs of 0.86 m, m/s."""
 _STEP_S = 0.55
 _TURN_RATE = np.radians(95.0)
 _WITHIN = 0.9
@@ -224,7 +223,7 @@ _WITHIN = 0.9
 
 
 def _walking_and_turning(name: str, person: Person, rng: np.random.Generator | None, seconds: float | None) -> Movement:
-    """Walks between random targets, turning towards each; the standard walk goes from side to side."""
+    """Walk between random targets, turning towards each; the standard walk goes from side to side."""
     manner = _Manner.of(rng)
     duration = 20.0 if seconds is None else seconds
     speed = _WALK_RATE * manner.tempo * float(np.sqrt(person.legs.mean() / 0.86))
@@ -276,7 +275,7 @@ def _walking_and_turning(name: str, person: Person, rng: np.random.Generator | N
 
 
 _OVER = posture(left=-0.022, pelvis_lateral=-3.0, trunk_lateral=2.5)
-"""Of walking, while the left foot is in the air: weight on the right one."""
+"""Posture of walking while the left foot is in the air: weight on the right one."""
 _LANDING = posture(
     pelvis_yaw=-4.0,
     trunk_axial=8.0,
@@ -285,25 +284,25 @@ _LANDING = posture(
     elbow_right=8.0,
     elbow_left=-8.0,
 )
-"""Of walking, when the left foot lands: the left hip and the right shoulder are ahead."""
+"""Posture of walking when the left foot lands: the left hip and the right shoulder are ahead."""
 _PACE = posture(trunk_flexion=3.0, pelvis_flexion=2.0, elbow=8.0)
-"""Of walking, always."""
+"""Constant posture of walking."""
 
 
 def _random(name: str, person: Person, rng: np.random.Generator | None, seconds: float | None) -> Movement:
-    """A random motion (``random_people``), on feet that follow it."""
+    """A random motion (``random_people``) on feet that follow it."""
     chance = np.random.default_rng(0) if rng is None else rng
     duration = 20.0 if seconds is None else seconds
     motion = RandomMotion(chance, duration, tempo=float(0.4 * 2.5 ** chance.random()))
 
     def base(times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Configurations, places and headings; the latter may be off by full turns."""
+        """Configurations, positions and headings; headings are modulo full turns."""
         q = motion.configuration(times)
         left = so3.quat_to_matrix(q[:, PELVIS_QUATERNION])[:, :, 1]
         return q, q[:, :2], np.arctan2(-left[:, 0], left[:, 1])
 
     def path(times: FloatArray) -> tuple[FloatArray, FloatArray]:
-        # headings are continuous in time: found between instants close to each other
+        # unwrap the headings on a dense time grid
         dense = np.arange(0.0, times.max() + 0.1, 0.05)
         _, _, turned = base(dense)
         _, places, yaw = base(times)
@@ -338,7 +337,7 @@ MOTIONS: dict[str, _Builder] = {
     "standing_still": _standing_still,
     "random": _random,
 }
-"""By name."""
+"""Motions by name."""
 
 
 def make_movement(
@@ -350,7 +349,7 @@ def make_movement(
         name: of :data:`MOTIONS`.
         person: the body.
         rng: for tempo, amplitude, asymmetry and sway; None for the standard performance.
-        seconds: its duration, reached by the number of repetitions; None for the usual one.
+        seconds: duration, reached by the number of repetitions; None for the usual one.
 
     Raises:
         RepertoireError: an unknown name, or too few seconds.

@@ -1,4 +1,4 @@
-"""Simulates people who move in front of sensors: the ground truth and the sensors' measurements."""
+"""Simulates people who move in front of sensors: ground truth and measurements."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from body_tracking.simulation.repertoire import Movement, make_movement
 
 WORLD: Final = "world"
 START_NS: Final = 40 * NANOSECONDS
-"""The reference sensor's clock at the start."""
+"""Time on the reference sensor's clock at the start."""
 RECEIVED_FROM_NS: Final = 1_750_000_000 * NANOSECONDS
-"""The receiver's clock at the start."""
+"""Time on the receiver's clock at the start."""
 MAX_PEOPLE: Final = 6
-"""As many bodies as a Kinect v2 tracks."""
+"""Largest number of bodies of a Kinect v2."""
 APART: Final = 0.9
-"""Metres between people side by side."""
+"""Distance between people side by side, metres."""
 LANE: Final = 0.7
-"""Metres between the lanes of people who walk past each other."""
+"""Distance between the lanes of people who walk past each other, metres."""
 _CLOCK_OFFSET_S, _CLOCK_DRIFT_PPM = 2.0, 50.0
-"""Greatest offset and drift of a sensor's clock against the reference sensor's."""
+"""Largest offset and drift of a sensor's clock relative to the reference sensor's."""
 _STEP = 1e-4
 """Half step of the central differences for velocities, seconds; accurate to 1e-6 m/s."""
 
@@ -49,12 +49,12 @@ class SceneError(BodyTrackingError):
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A person's initial place, relative to that of a single person in the layout.
+    """A person's initial position, relative to that of a single person in the layout.
 
     Attributes:
         ahead: metres forward.
         left: metres to the left.
-        turn: radians, turned to the left.
+        turn: heading, turned to the left, radians.
     """
 
     ahead: float
@@ -63,7 +63,7 @@ class Place:
 
 
 def side_by_side(number: int) -> tuple[Place, ...]:
-    """The first at the layout's place, the others 1, -1, 2, -2, ... places to the left."""
+    """The first person at the layout's position, the others 1, -1, 2, -2, ... intervals to the left."""
     return tuple(Place(0.0, APART * ((k + 1) // 2 * (1 if k % 2 else -1))) for k in range(number))
 
 
@@ -78,16 +78,16 @@ class Setup:
 
     Attributes:
         motion: one of ``repertoire.MOTIONS``; performed by all people, each in their own manner.
-        layout: places of the sensors.
-        people: drawn at random where None.
+        layout: poses of the sensors.
+        people: None to draw them at random.
         number: of people to draw.
         imus: worn by the first person.
-        seconds: of the recording; the motion's own length where None.
+        seconds: of the recording; None for the motion's own length.
         seed: of the random generators.
         standard: the motion as the thesis shows it, without an individual manner.
         errors: of the cameras.
-        dark: without light a Kinect takes 15 frames a second.
-        places: initial places; side by side where None.
+        dark: without light, a Kinect captures 15 frames per second.
+        places: initial positions; None for side by side.
         surroundings: of the inertial sensors.
     """
 
@@ -118,7 +118,7 @@ class Setup:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """One person, in ``world``, at the captures of the reference sensor and in its clock.
+    """Ground truth of one person in ``world``, at the captures of the reference sensor and by its clock.
 
     Attributes:
         person: the body.
@@ -137,7 +137,7 @@ class Truth:
     rates: FloatArray
 
     def skeleton(self, instant: int, body: int = 0) -> Skeleton:
-        """The joints at an instant, all Tracked."""
+        """The joints at an instant, all tracked."""
         tracked = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
         return Skeleton(
             int(self.stamps_ns[instant]),
@@ -168,7 +168,7 @@ class SimulatedRecording:
     """Ground truth and measurements.
 
     Attributes:
-        setup: its parameters.
+        setup: of the simulation.
         duration: seconds.
         sensors: the cameras, the reference first.
         frames: of all cameras, in the order of receipt.
@@ -186,7 +186,7 @@ class SimulatedRecording:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Actor:
-    """A person with a movement, an initial pose, and the misreading that all sensors share."""
+    """A person with a movement, an initial pose, and the misreading common to all sensors."""
 
     person: Person
     misreading: Misreading
@@ -195,7 +195,7 @@ class _Actor:
     yaw: float
 
     def course(self, times: FloatArray) -> Course:
-        """In ``world``."""
+        """The body at (n,) seconds in ``world``."""
         return self.movement.course(np.clip(times, 0.0, self.movement.duration)).placed(self.position, self.yaw)
 
     def positions(self, times: FloatArray) -> FloatArray:
@@ -221,10 +221,10 @@ class _Actor:
 
 
 def simulate(setup: Setup) -> SimulatedRecording:
-    """Simulate a recording; the same setup gives the same numbers.
+    """Simulate a recording; equal setups give equal numbers.
 
-    People, movements, each sensor's clock and each sensor's errors have generators of their own, so that another sensor
-    or another error changes nothing else.
+    People, movements, each sensor's clock and each sensor's errors have their own generators, so that adding a sensor
+    or an error changes nothing else.
 
     Raises:
         RepertoireError: an unknown motion, or too few seconds for it.
@@ -264,7 +264,7 @@ _Seen = tuple[FloatArray, NDArray[np.uint8]]
 
 
 def _numbered(seen: Sequence[_Seen]) -> dict[int, _Seen]:
-    """Each person's measurements by the sensor's body numbers: a person who appears gets the lowest free number."""
+    """Each person's measurements by the sensor's body numbers; a new person gets the lowest free number."""
     if len(seen) == 1:
         return {0: seen[0]}
     there = np.stack([states.any(axis=1) for _, states in seen], axis=1)
@@ -317,7 +317,7 @@ def _sensors(setup: Setup) -> tuple[SimulatedKinect, ...]:
 def _samples(
     imu: SimulatedImu, actor: _Actor, surroundings: Surroundings, duration: float, rng: np.random.Generator
 ) -> ImuSamples:
-    """The samples of an inertial sensor that a person wears."""
+    """Samples of an inertial sensor worn by a person."""
     segment = MODEL.segment_names.index(imu.segment)
     latest: list[tuple[FloatArray, Posture]] = []
 

@@ -1,4 +1,4 @@
-"""The commands of the simulator."""
+"""Commands of the simulator."""
 
 from __future__ import annotations
 

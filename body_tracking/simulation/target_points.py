@@ -1,7 +1,7 @@
-"""What a stereo rig measures of targets: noisy pixels, triangulated linearly, with covariance.
+"""Simulated stereo measurements of targets: noisy pixels, triangulated linearly, with covariance.
 
-The rig of Gaschler 2011, section 6.1: f 834 pixels, 0.48 m apart, toed in by 13 degrees, 0.1 pixel noise. Its frame is
-in the middle between the cameras, z forward.
+The rig of Gaschler 2011, section 6.1: f 834 pixels, baseline 0.48 m, toed in by 13 degrees, 0.1 pixel noise. Its frame
+is midway between the cameras, z forward.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ TARGET_POINTS = TARGET_POINTS - TARGET_POINTS.mean(axis=0)
 
 
 def project(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Pixels (2, n, 2) about the principal point, and the Jacobians (2, n, 2, 3)."""
+    """Pixels (2, n, 2) relative to the principal point, and Jacobians (2, n, 2, 3)."""
     inside = np.einsum("cij,nj->cni", ROTATIONS, points) + TRANSLATIONS[:, None]
     depth = inside[..., 2]
     pixels = _FOCAL * inside[..., :2] / depth[..., None]
@@ -44,7 +44,7 @@ def project(points: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def measure(true: FloatArray, rng: np.random.Generator, stamp_ns: int = 0, pixel_noise: float = PIXEL_NOISE) -> Points:
-    """Noisy points with their covariance, in the order of the true ones: linear (Gaschler eq. 3.4-3.5)."""
+    """Noisy points with covariance, in the order of the true ones, by linear triangulation (Gaschler eq. 3.4-3.5)."""
     pixels, _ = project(true)
     poses = np.concatenate([ROTATIONS, TRANSLATIONS[..., None]], axis=2)
     flat = (pixels + rng.normal(0.0, pixel_noise, pixels.shape)) / _FOCAL
@@ -57,12 +57,12 @@ def measure(true: FloatArray, rng: np.random.Generator, stamp_ns: int = 0, pixel
 
 
 def random_rotation(rng: np.random.Generator) -> FloatArray:
-    """(3, 3) any rotation, all as likely."""
+    """(3, 3) uniformly distributed random rotation."""
     return np.asarray(Rotation.random(random_state=rng).as_matrix())
 
 
 def random_targets(rng: np.random.Generator, count: int, noise: float = 8e-4) -> list[Target]:
-    """Targets of 98 mm, not flat, of five balls 25 mm apart or more, which can be distinguished at a noise (metres)."""
+    """Targets of 98 mm, not flat, with five balls at least 25 mm apart, distinguishable at this noise (metres)."""
     targets: list[Target] = []
     while len(targets) < count:
         points = rng.uniform(-1.0, 1.0, (5, 3))
@@ -85,14 +85,14 @@ def random_targets(rng: np.random.Generator, count: int, noise: float = 8e-4) ->
 
 @lru_cache(maxsize=100)
 def target_set(number: int, count: int = 5) -> list[Target]:
-    """A set of targets of five balls, the same for the same number."""
+    """A set of targets of five balls, determined by the number."""
     return random_targets(np.random.default_rng([number, 1]), count)
 
 
 def scene(
     targets: list[Target], distance: float, rng: np.random.Generator, spurious: int = 80, hidden: int = 1
 ) -> tuple[FloatArray, FloatArray, list[tuple[FloatArray, FloatArray]], list[FloatArray]]:
-    """True points shuffled, owner (n, 2) target and ball (-1 for spurious), poses, and indices (k,) of each target."""
+    """Shuffled true points, owners (n, 2): target and ball (-1: spurious), poses, and point indices (k,) per target."""
     poses: list[tuple[FloatArray, FloatArray]] = []
     rows: list[FloatArray] = []
     owners: list[tuple[int, int]] = []
@@ -128,10 +128,11 @@ def scene(
 def moving(
     targets: list[Target], distance: float, rng: np.random.Generator, frames: int, spurious: int
 ) -> Iterator[tuple[int, FloatArray, list[tuple[FloatArray, FloatArray]], list[FloatArray]]]:
-    """Frames at 60 Hz of targets that swing about a place each and turn: stamps, and what :func:`scene` gives.
+    """Frames at 60 Hz of targets that swing about a position and turn: stamp, and points, poses, indices of
+    :func:`scene`.
 
-    Amplitudes of 4 cm at up to 1 Hz and 0.6 rad at up to 1 Hz. One ball of each target is hidden, another one after
-    every 20 frames. Half of the spurious points are near the targets, and all of them stay where they are.
+    Amplitudes of 4 cm and 0.6 rad at up to 1 Hz. One ball of each target is hidden; it changes every 20 frames. Half of
+    the spurious points are near the targets, and all of them are stationary.
     """
     count = len(targets)
     _, owner, poses, _ = (first := scene(targets, distance, rng, spurious, 0))

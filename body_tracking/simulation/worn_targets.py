@@ -1,4 +1,4 @@
-"""Targets of the marker system on a simulated person, as bags: a reference with a clock and a frame of its own."""
+"""Targets of the marker system on a simulated person, as bags: a reference with its own clock and frame."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from body_tracking.simulation.people import MODEL
 ARM = ("clavicle_left", "upper_arm_left", "forearm_left")
 _FRAME = "left_optical_frame"
 _PLACE_STDDEV = 0.0003
-"""Metres; places are not used."""
+"""Standard deviation of positions, metres; positions are not used."""
 _ANGLE_STDDEV = float(np.radians(0.16))
-"""Radians that the marker system states of its angle."""
+"""Standard deviation that the marker system states for its angle, radians."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WornTargets:
-    """What the marker system measures of targets on segments.
+    """Measurements by the marker system of targets on segments.
 
     Attributes:
-        segments: k that carry a target each.
-        times: (n,) s by the marker system's clock.
+        segments: k names, each with a target.
+        times: (n,) s on the marker system's clock.
         rotations: (n, k, 3, 3) targets to rig, with noise.
-        stddev: radians per axis, of the noise.
+        stddev: of the noise, radians per axis.
         mountings: (k, 3, 3) true target to segment.
         world: (3, 3) true rig to world.
     """
@@ -52,18 +52,18 @@ class WornTargets:
     world: FloatArray
 
     def until(self, seconds: float) -> WornTargets:
-        """Only the measurements of the first seconds."""
+        """The measurements of the first seconds."""
         count = int(np.searchsorted(self.times, self.times[0] + seconds))
         return replace(self, times=self.times[:count], rotations=self.rotations[:count])
 
     @property
     def covariances(self) -> FloatArray:
-        """(n, 3, 3) square radians, of each target."""
+        """(n, 3, 3) covariances of a target, square radians."""
         return np.broadcast_to(self.stddev**2 * np.eye(3), (len(self.times), 3, 3))
 
 
 def segment_rotations(q: FloatArray, segments: Sequence[str]) -> FloatArray:
-    """(n, k, 3, 3) true segments to world of (n, 35) configurations."""
+    """(n, k, 3, 3) true rotations from segments to world, for (n, 35) configurations."""
     columns = [MODEL.segment_names.index(name) for name in segments]
     rotations: FloatArray = MODEL.forward(q, MODEL.default_lengths()).rotations[:, columns]
     return rotations
@@ -79,16 +79,16 @@ def wear_targets(
     offset: float = 0.0,
     drift: float = 0.0,
 ) -> WornTargets:
-    """Targets with random mountings before a rig with a random orientation.
+    """Targets with random mountings in front of a rig with a random orientation.
 
     Args:
-        times: (n,) s of the world's clock.
+        times: (n,) s on the world's clock.
         q: (n, 35) configurations of the person.
         rng: draws mountings, rig and noise.
-        segments: that carry a target.
-        stddev: radians per axis, of white noise of each pose.
-        offset: s, the marker system's clock minus the world's at 0.
-        drift: of that.
+        segments: with a target each.
+        stddev: white noise of each pose, radians per axis.
+        offset: s, the marker system's clock minus the world's at time 0.
+        drift: relative drift of this offset.
     """
     mountings = Rotation.random(len(segments), random_state=rng).as_matrix()
     world = Rotation.random(random_state=rng).as_matrix()
@@ -104,16 +104,16 @@ def write_targets(
     *,
     names: Sequence[str] | None = None,
 ) -> None:
-    """Write poses of the targets, and an angle with its deviation, as the marker system's nodes do.
+    """Write poses of the targets, and an angle with its standard deviation, as the marker system's nodes do.
 
     Args:
         worn: the targets.
         folder: of the bag.
         start_ns: stamp of time 0.
-        names: of the targets; those of their segments where None.
+        names: of the targets; None for those of their segments.
 
     Raises:
-        BagError: the folder exists, or it cannot be written.
+        BagError: the folder exists, or cannot be written.
     """
     names = worn.segments if names is None else names
     angle = graph.joint_states_topic(setup.BODY)
