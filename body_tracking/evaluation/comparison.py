@@ -201,7 +201,7 @@ def evaluate(
     mine = estimate.angles
     truly = truth.angles if mine is None else true_angles(mine.names, truth.angles, truth.coordinates)
     if mine is not None and truly is not None and mine.names != truly.names:
-        notes.append("estimate and truth have different sets of angles: one name may mean two things")
+        notes.append("estimate and truth have different sets of angles: those with common names are compared")
     comparisons = []
     for number, (name, alignment) in enumerate(alignments.items()):
         comparisons.append(_compare(name, alignment, whole, curve, estimate, truth, truly, own_clock))

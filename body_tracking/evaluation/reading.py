@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from body_tracking.core.message_types import JOINT_STATE, POINT_CLOUD, TIME_REFE
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray, Skeleton
 from body_tracking.evaluation.plug_in_gait import read_measurements, read_plug_in_gait
 from body_tracking.kinematics.conventions import CONVENTIONS, angles_of, convention
+from body_tracking.kinematics.positional import ANGLE_NAMES
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.base import MessageError, to_nanoseconds
 from body_tracking.messages.calibration import time_reference_to_clock, transform_to_pose
@@ -27,6 +29,9 @@ from body_tracking.recording.rosbag2 import BagReader, RawMessage, deserialize
 
 _PREFIX, _SUFFIX = "/humans/bodies/", "/joint_states"
 _MATCH_NS = NANOSECONDS // 50
+_IN_EVERY_CONVENTION: Final = ("elbow_flexion_left", "elbow_flexion_right")
+"""Positional angles that are the same in every convention that has their names. The trunk flexion of the others is
+against the pelvis, not the vertical; ISB's shoulder elevation has the other sign."""
 _EXACT, _AMPLIFIED = 1e-6, 10.0
 """Assumed error of the true pose, radians; true angles that amplify it by more than the factor are ignored."""
 
@@ -55,6 +60,11 @@ class AngleSeries:
     def known(self) -> FloatArray:
         """(n, m) the angles, NaN where unobserved."""
         return np.where(np.isfinite(self.stddev), self.position, np.nan)
+
+    def only(self, names: tuple[str, ...]) -> AngleSeries:
+        """Some of the angles."""
+        columns = [self.names.index(name) for name in names]
+        return AngleSeries(self.stamps_ns, names, self.position[:, columns], self.stddev[:, columns])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -182,14 +192,15 @@ def true_angles(names: tuple[str, ...], own: AngleSeries | None, coordinates: An
         coordinates: the true coordinates of the body model; None if there are none.
 
     Returns:
-        Angles computed from the coordinates if there are any and the names are those of a convention; else ``own``.
+        Angles computed from the coordinates if there are any and the names are those of a convention. Else ``own``;
+        if the evaluated angles are of another convention than these, only those that are the same in both.
     """
-    if coordinates is None:
-        return own
     model = UpperBody()
     of_names = {convention(name, model).names: name for name in CONVENTIONS}
-    if names not in of_names or coordinates.names != model.coordinate_names:
+    if names not in of_names:
         return own
+    if coordinates is None or coordinates.names != model.coordinate_names:
+        return own if own is None or own.names != ANGLE_NAMES else own.only(_IN_EVERY_CONVENTION)
     exact = _EXACT**2 * np.eye(2 * model.nv)
     lengths = model.default_lengths()  # angles do not depend on them
     rates = np.zeros(model.nv)

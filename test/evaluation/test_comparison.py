@@ -29,7 +29,7 @@ from body_tracking.evaluation.reading import (
     read_truth,
     truth_of_markers,
 )
-from body_tracking.kinematics.conventions import CONVENTIONS, angles_of
+from body_tracking.kinematics.conventions import CONVENTIONS, angles_of, convention
 from body_tracking.kinematics.positional import ANGLE_NAMES
 from body_tracking.kinematics.upper_body import UpperBody
 from draws import some
@@ -172,6 +172,19 @@ def test_the_models_true_coordinates_give_the_true_angles_in_the_estimates_conve
     assert compared.mean() > 0.7
     assert_allclose(named.errors.offset[compared], 0.02, atol=1e-5)
     assert_allclose(named.errors.fixed_rmse[compared], 0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", CONVENTIONS)
+def test_positional_truth_is_compared_only_with_angles_that_are_the_same(name: str) -> None:
+    """Names that two conventions share may stand for different angles: ISB's elevation has the other sign."""
+    names = convention(name, UpperBody()).names
+    mine = estimate()
+    flexed = np.full((len(mine.stamps_ns), len(names)), 0.5)
+    angles = AngleSeries(mine.stamps_ns, names, flexed, 0.1 * np.ones_like(flexed))
+    right = truth()
+    assert right.angles is not None and right.angles.names == ANGLE_NAMES
+    named = evaluate(replace(mine, angles=angles), replace(right, coordinates=None)).comparisons[0].named
+    assert (named.names if named else ()) == tuple(each for each in names if each.startswith("elbow_flexion"))
 
 
 def test_a_truth_with_a_clock_and_a_frame_of_its_own_is_found_by_its_movement() -> None:
