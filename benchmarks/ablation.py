@@ -1,20 +1,20 @@
 """What each mechanism is worth: the same simulated people with all mechanisms, and with one of them switched off.
 
-Every row is a mechanism that is off, every figure the mean over the people and, after it, half the width of the 95 %
-confidence interval of the difference to all mechanisms on the same people: a difference that is smaller is chance.
-People, motions, layouts and seeds are none that anything was tuned on.
+Each row is one mechanism switched off. Each figure is the mean over the people; after it, half the width of the 95 %
+confidence interval of the difference to all mechanisms on the same people. A smaller difference is chance. Nothing was
+tuned on these people, motions, layouts and seeds.
 
 1. Left and right (``fusion.sides`` and the gate of ``fusion.fusion``), fused skeletons: RMS error of the twist of
    shoulders against hips (deg), share of the frames in which it is wrong by more than 60 deg (%), share of frames with
    shoulders or hips reversed (%), mean error of the ten joints of the thesis (mm).
-2. The same on the real pairs of Kinects (no truth; ``--data``), filtered skeletons: reversals of shoulders or hips
-   between two frames, turns of them by more than 30 deg between two frames, share of the frames in which shoulders are
-   twisted against hips by more than 60 deg (%).
-3. The same on the shipped recordings, default filter: greatest error of a trunk angle (deg), frames in which an angle
-   is off by more than 3 stated deviations.
+2. The same on the real pairs of Kinects (without truth; ``--data``), filtered skeletons: number of reversals of
+   shoulders or hips between two frames, number of their turns by more than 30 deg between two frames, share of the
+   frames in which shoulders are twisted against hips by more than 60 deg (%).
+3. The same on the shipped recordings, default filter: largest error of a trunk angle (deg), number of angles with an
+   error of more than 3 stated standard deviations.
 4. The posture prior (``kinematics.posture``), filter ``ekf``: RMS error of trunk, lumbar and thoracic flexion, shoulder
-   abduction and elbow flexion (deg), and the share of errors within 1.96 stated deviations (%); with the prior's
-   deviations halved and doubled, too.
+   abduction and elbow flexion (deg), and the share of errors within 1.96 stated standard deviations (%); also with the
+   prior's standard deviations halved and doubled.
 
   python benchmarks/ablation.py                        24 people: about 40 minutes on two cores
   python benchmarks/ablation.py --seeds 1 --parts sides
@@ -55,7 +55,7 @@ _SHOULDERS, _HIPS = (
     (Joint.HIP_LEFT, Joint.HIP_RIGHT),
 )
 _FIRST_SEED = 5000
-"""Far from the seeds of every other benchmark."""
+"""Far from the seeds of all other benchmarks."""
 
 
 def _no_exemption(gated: Callable[..., FloatArray]) -> Callable[..., FloatArray]:
@@ -72,7 +72,7 @@ SIDES: Mapping[str, Callable[[], Any]] = {
     "bounded turning": lambda: patch.multiple(sides, TURN_RATE=math.inf, TURN_ONCE=math.inf),
     "weights by width": lambda: patch.object(sides, "heading_weights", lambda points, variance: [1.0, 1.0]),
 }
-"""Mechanism, and a context without it."""
+"""Per mechanism, a context manager that switches it off."""
 
 
 def _scaled(factor: float) -> Any:
@@ -99,7 +99,7 @@ FLEXIONS = {
 
 
 def _heading(points: FloatArray, pair: tuple[int, int]) -> FloatArray:
-    """(n,) radians, of the axis between two joints of (n, 25, 3)."""
+    """(n,) headings of the axis between two joints of (n, 25, 3), radians."""
     axis = points[:, pair[0]] - points[:, pair[1]]
     heading: FloatArray = np.arctan2(axis[:, 1], axis[:, 0])
     return heading
@@ -108,7 +108,7 @@ def _heading(points: FloatArray, pair: tuple[int, int]) -> FloatArray:
 def _against_truth(
     angles: AngleSeries, truth: AngleSeries | None, names: Sequence[str]
 ) -> tuple[FloatArray, FloatArray]:
-    """(n, k) radians: errors of angles where the truth is known, and their stated standard deviations."""
+    """(n, k) errors of angles at stamps with a known truth, and (n, k) their stated standard deviations; radians."""
     assert truth is not None
     matches = nearest(truth.stamps_ns, angles.stamps_ns)
     here = matches >= 0
@@ -142,7 +142,7 @@ def of_sides(run: Run, name: str) -> dict[str, float]:
 
 
 def of_posture(run: Run, name: str) -> dict[str, float]:
-    """The figures of part 2."""
+    """The figures of part 4."""
     without, parameters = POSTURE[name]
     with tempfile.TemporaryDirectory() as folder, without():
         write_bag(run.recording(), Path(folder) / "in")
@@ -161,7 +161,7 @@ def of_posture(run: Run, name: str) -> dict[str, float]:
 
 
 def of_real(file: Path, name: str) -> dict[str, float]:
-    """The figures of part 2, of one recording."""
+    """The figures of part 2 for one recording."""
     with tempfile.TemporaryDirectory() as folder, SIDES[name]():
         import_files([file], Path(folder) / "in")
         replay(Path(folder) / "in", Path(folder) / "out", ReplaySettings(()))
@@ -178,7 +178,7 @@ def of_real(file: Path, name: str) -> dict[str, float]:
 
 
 def of_shipped(bag: Path, name: str) -> dict[str, float]:
-    """The figures of part 3, of one recording."""
+    """The figures of part 3 for one recording."""
     with tempfile.TemporaryDirectory() as folder, SIDES[name]():
         replay(bag, Path(folder) / "out", ReplaySettings(()))
         tracked = read(Path(folder) / "out")
@@ -207,7 +207,7 @@ def _measure(job: tuple[str, Any, str]) -> dict[str, float]:
 
 
 def figures_of(part: str, names: Sequence[str], runs: Sequence[Any], processes: int) -> dict[str, dict[str, Any]]:
-    """Of each mechanism that is off the mean of each figure, and how it differs from that with all mechanisms."""
+    """Per mechanism switched off: the mean of each figure, and its difference to all mechanisms."""
     jobs = [(part, run, name) for run in runs for name in names]
     results = dict(zip(jobs, common.mapped(_measure, jobs, processes), strict=True))
     figures: dict[str, dict[str, Any]] = {}

@@ -1,21 +1,21 @@
-"""How accurate each method is, on simulated people of whom everything is known: single sensor, thesis, ours.
+"""Accuracy of each method on simulated people with a known truth: single sensor, thesis, ours.
 
-Every run is a person who does one thing in their own way before Kinect v2 sensors that err like real ones
-(``calibrate_simulator.py`` says how like). All methods get the same frames. Nobody is in any of them whom the simulator
-was calibrated with, and most motions are others; nothing here was used to tune a filter.
+Each run is a person who performs one motion in their own way in front of Kinect v2 sensors with realistic errors
+(``calibrate_simulator.py`` compares them with real ones). All methods get the same frames. The simulator was calibrated
+with other people and mostly other motions; no filter was tuned on these runs.
 
-methods   ``one sensor``: what kinect1 says, in world; ``thesis ...``: the pipeline of Schlagenhauf (2017)
+methods   ``one sensor``: the skeleton of kinect1, in world; ``thesis ...``: the pipeline of Schlagenhauf (2017)
           (``thesis_pipeline``); ``fused``, ``default`` and ``ekf``: this package at its defaults, offline, through the
-          messages of the live graph (calibration, fusion, filter, joint angles). ``offsets alone`` is none: a sensor
-          that is wrong by nothing but where it takes the joints' centres to be, which no method can know.
-errors    of the ten joints of the thesis's model, in world, at the stamps that each method claims, from when all have
-          begun: mean 3D error (mm); the same without each joint's constant offset in the body's own frames ("fixed");
-          the latter where a joint is hidden from one sensor or more; RMSE of shoulder elevation and elbow flexion
-          (degrees); share of the frames in which these lie within 1.96 stated standard deviations; delay (ms) by the
-          stamps, without what a method waits for.
+          messages of the live graph (calibration, fusion, filter, joint angles). ``offsets alone`` is no method but a
+          sensor whose only errors are the constant offsets of its joint centres, which no method can know.
+errors    of the ten joints of the thesis's model, in world, at the stamps that each method claims, from the time when
+          all methods have started: mean 3D error (mm); the same without each joint's constant offset in the body's
+          own frames ("fixed"); "fixed" where a joint is hidden from one sensor or more; RMSE of shoulder elevation
+          and elbow flexion (degrees); share of the frames with these angles within 1.96 stated standard deviations;
+          delay by the stamps (ms), without the time that a method waits.
 
 Parts: ``main`` (every motion in layout 4), ``layouts`` (the nine layouts), ``sensitivity`` (every parameter of the
-simulator at half and at double). Means over seeds with 95 % confidence intervals (Student). ``--write`` writes
+simulator halved and doubled). Means over seeds with 95 % confidence intervals (Student). ``--write`` writes
 these parts of docs/accuracy.md and its figure.
 """
 
@@ -58,20 +58,20 @@ ONE, FUSED, DEFAULT, OURS = "one sensor", "fused", f"default ({DEFAULT_FILTER})"
 ALONE = "offsets alone"
 METHODS = (ALONE, ONE, FUSED, LKF1, LKF2, EKF, DEFAULT, OURS)
 KNOWN = ("two_handed_wave", "slow_down", "torso_twist", "move_along")
-"""Motions that the simulator was calibrated with."""
+"""Motions with which the simulator was calibrated."""
 TWIST = "torso_twist"
 ANGLES = {
     "elevation": [ANGLE_NAMES.index(f"shoulder_elevation_{side}") for side in ("left", "right")],
     "elbow": [ANGLE_NAMES.index(f"elbow_flexion_{side}") for side in ("left", "right")],
 }
 _FIRST_SEED = 1000
-"""Far from the subjects of the calibration."""
+"""Far from the seeds of the calibration."""
 _HIDDEN_FROM = 0.35
 
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """What is simulated: a motion, a layout, a seed, and one parameter of the sensors times a factor, if any."""
+    """A motion, a layout, a seed, and optionally one parameter of the sensors times a factor."""
 
     motion: str
     layout: int = 4
@@ -80,7 +80,7 @@ class Run:
     factor: float = 1.0
 
     def recording(self, *, offsets_alone: bool = False) -> SimulatedRecording:
-        """Simulate it, or the same with sensors that are wrong by nothing but where they take the joints to be."""
+        """Simulate the run; with ``offsets_alone``, the offsets of the joint centres are the sensors' only errors."""
         errors = KinectErrors()
         if self.parameter:
             errors = errors.scaled(self.factor, (self.parameter,))
@@ -91,7 +91,7 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """Of one method in one run; NaN where there is nothing to say."""
+    """Figures of one method in one run, in mm, degrees, shares and ms; NaN where they are not defined."""
 
     error: float
     fixed: float
@@ -111,7 +111,7 @@ def run_ours(recording: SimulatedRecording, filter_name: str) -> tuple[list[Skel
 
 
 def filtered_by(settings: ReplaySettings, frames: Sequence[RecordedFrame]) -> tuple[list[Skeleton], list[Skeleton]]:
-    """Fused and filtered skeletons of the graph, of frames of its sensors in the order of receipt."""
+    """Fused and filtered skeletons of the graph from frames of its sensors in the order of receipt."""
     found: dict[str, list[Skeleton]] = {graph.FUSED: [], graph.FILTERED: []}
 
     def take(topic: str, cdr: bytes, _at_ns: int) -> None:
@@ -127,7 +127,7 @@ def filtered_by(settings: ReplaySettings, frames: Sequence[RecordedFrame]) -> tu
 
 
 def reported(recording: SimulatedRecording) -> list[Skeleton]:
-    """What the first sensor says, in world."""
+    """Skeletons of the first sensor, in world."""
     reference = recording.sensors[0].pose
     return [
         Skeleton(each.stamp_ns, "world", reference.apply(each.positions), each.states)
@@ -138,7 +138,7 @@ def reported(recording: SimulatedRecording) -> list[Skeleton]:
 
 
 def outputs_of(recording: SimulatedRecording, methods: Sequence[str]) -> dict[str, list[Skeleton]]:
-    """What each method makes of a recording, in world and in the reference clock."""
+    """Output of each method for a recording, in world and in the reference clock."""
     outputs: dict[str, list[Skeleton]] = {}
     if ONE in methods:
         outputs[ONE] = reported(recording)
@@ -155,7 +155,7 @@ def outputs_of(recording: SimulatedRecording, methods: Sequence[str]) -> dict[st
 
 
 def figures_of(run: Run, methods: Sequence[str] = METHODS) -> dict[str, Figures]:
-    """Simulate a run and measure every method."""
+    """Simulate a run and evaluate every method."""
     recording = run.recording()
     truth = recording.truths[0]
     zero = int(truth.stamps_ns[0])
@@ -183,9 +183,15 @@ def compared(
     zero_ns: int,
     of_bones: float = BONE_CORRELATION,
 ) -> Figures:
-    """Skeletons beside the true joints over seconds from a stamp, and the person's limbs as the sensors see them.
+    """Compare skeletons with the true joints.
 
-    ``of_bones`` is the parameter ``bone_correlation`` of ``joint_angles``.
+    Args:
+        skeletons: output of a method, in world.
+        poses: of the sensors in world, for hidden joints.
+        capsules: the person's limbs, which hide joints.
+        curve: true joints by time, seconds.
+        zero_ns: stamp of the curve's time 0.
+        of_bones: parameter ``bone_correlation`` of ``joint_angles``.
     """
     times = np.array([(each.stamp_ns - zero_ns) / NANOSECONDS for each in skeletons])
     first, last = curve.span
@@ -224,7 +230,7 @@ def _nanmean(values: FloatArray) -> float:
 
 
 def _hidden(poses: Sequence[SensorPose], capsules: Capsules, true: FloatArray) -> BoolArray:
-    """(n, 25) which joints lie behind the body for one sensor or more."""
+    """(n, 25) whether a joint lies behind the body for one sensor or more."""
     return np.any(
         [obstruction((true - pose.translation) @ pose.rotation, capsules).cover > _HIDDEN_FROM for pose in poses],
         axis=0,
@@ -236,7 +242,7 @@ def _true_skeleton(positions: FloatArray) -> Skeleton:
 
 
 def _angles(skeletons: Iterable[Skeleton], of_bones: float = BONE_CORRELATION) -> tuple[FloatArray, FloatArray]:
-    """(n, m) positional angles and their standard deviations, radians; NaN and infinity where there is none."""
+    """(n, m) positional angles and their standard deviations, radians; NaN and infinity where unknown."""
     found = [positional_angles(each, of_bones) for each in skeletons]
     return np.stack([each.position for each in found]), np.stack([each.position_stddev for each in found])
 
@@ -280,7 +286,7 @@ def layouts_part(seeds: int, workers: int, motions: Sequence[str]) -> Table:
 
 
 def sensitivity_part(seeds: int, workers: int, motions: Sequence[str]) -> Table:
-    """Each parameter at half and at double."""
+    """Each parameter of the simulator halved and doubled."""
     runs = [
         Run(motion, 4, _FIRST_SEED + seed, item.name, factor)
         for item in parameters()
@@ -298,7 +304,7 @@ DOCS = common.ROOT / "docs"
 
 
 def page(text: str, parts: Mapping[str, Table]) -> str:
-    """docs/accuracy.md with the sections of these parts written anew; what is around them stays."""
+    """docs/accuracy.md with new sections of these parts; the rest stays."""
     for part, table in parts.items():
         begin, end = f"<!-- {part}: written by benchmarks/accuracy.py -->\n", f"<!-- end of {part} -->\n"
         before, found, rest = text.partition(begin)
@@ -362,7 +368,7 @@ _TITLES = {
 
 
 def _unposed(motions: Iterable[str]) -> list[str]:
-    """Those that do not begin with a T-pose."""
+    """The motions that do not begin with a T-pose."""
     anybody = Person.average("female")
     return [motion for motion in motions if not make_movement(motion, anybody, None).tpose_s]
 
@@ -412,7 +418,7 @@ def _ratios(table: Table) -> list[str]:
 
 
 def draw_layouts(table: Table, path: Path) -> None:
-    """The mean error of the default by motion and layout, as a figure."""
+    """Draw the mean error of the default pipeline by motion and layout."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure as Picture
 

@@ -1,14 +1,14 @@
 """The thesis's baseline tests on rendered recordings: a robot arm's red balls, a pendulum's frequency.
 
 ``arm``: three trials of one motion for each injected delay of the camera's stamps; colour and depth images with the
-errors of the depth simulator, 15 a second, 10 % lost, times of capture irregular by 10 ms. Delay and registration are
-fitted on the first trial; the figures are the worst axis and trial of the two others, and the error of the delay.
+errors of the depth simulator, 15 a second, 10 % lost, capture times irregular by 10 ms. Delay and registration are
+fitted to the first trial; the figures are the worst axis and trial of the two others, and the error of the delay.
 
-``pendulum``: five lengths, 20 s at 30 Hz; mean and worst absolute error of the frequency, and the share within 3 mHz.
+``pendulum``: five lengths, 20 s at 30 Hz; mean and largest absolute error of the frequency, and the share within 3 mHz.
 ``images`` are rendered (infrared of 8 bits, a ball of 20 mm at 1.5 m), the others add noise of 0.2 pixels to the true
-places; each row but the first loses 10 % of the frames and has times of capture irregular by 10 ms. ``stamps``: off by
-10 ms more. ``floor``: the least standard deviation (Cramer-Rao) of a frequency with that noise in the places.
-Not to be recommended are fits ``without amplitude``, as if the period did not depend on it, at ``even steps`` of 1/30 s
+pixels; each row but the first loses 10 % of the frames and has capture times irregular by 10 ms. ``stamps``: stamps
+with 10 ms more noise. ``floor``: the least standard deviation (Cramer-Rao) of a frequency by that noise of the pixels.
+Methods not recommended: fits ``without amplitude``, as if the period did not depend on it, at ``even steps`` of 1/30 s
 from one frame to the next, and the highest ``peak`` of the spectrum.
 
 ``vicon``: the pendulum of Szczesna et al. (2016) after each release, by Vicon and by the gyroscope on each link.
@@ -35,14 +35,14 @@ from body_tracking.simulation.baseline_scenes import RADIUS, ArmScene, PendulumS
 
 DELAYS = (-0.1, 0.04, 0.2)
 ERROR_BAR, REPEATABILITY_BAR, DELAY_BAR, FREQUENCY_BAR = 10.0, 2.0, 5.0, 3.0
-"""Millimetres, milliseconds and millihertz."""
+"""Bars: arm error and repeatability, mm; delay, ms; frequency, mHz."""
 SECONDS, PIXEL_NOISE, JITTER = 20.0, 0.2, 0.01
 ARM_RATE = 15.0
-"""Images a second of the arm, which take most of the benchmark's time."""
+"""Frame rate of the arm's images, Hz; they take most of the benchmark's time."""
 
 
 def trial(seed: int, delay: float) -> Trial:
-    """One trial, of which every image is rendered and looked at."""
+    """One trial; each image is rendered and evaluated."""
     scene, rng = ArmScene(seed=seed), np.random.default_rng([seed, 71])
     lead = rng.uniform(0.0, 0.8)
     times = capture_times(scene.seconds + lead, rng, ARM_RATE)
@@ -74,13 +74,13 @@ def arm(job: tuple[int, float]) -> dict[str, float]:
 
 
 def seen(scene: PendulumScene, times: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """(n,) sines by places in the image with noise."""
+    """(n,) sines from the true pixels with noise."""
     pixels = scene.camera.project(scene.balls(times)) + rng.normal(0.0, PIXEL_NOISE, (len(times), 2))
     return sines(scene.camera.undistort(pixels))
 
 
 def rendered(scene: PendulumScene, times: FloatArray) -> FloatArray:
-    """(n,) sines by rendered images; NaN where not one ball is found."""
+    """(n,) sines from rendered images; NaN unless exactly one ball is found."""
     pixels = np.full((len(times), 2), np.nan)
     for number, ball in enumerate(scene.balls(times)):
         infrared, depth = scene.images(ball, number)
@@ -91,13 +91,13 @@ def rendered(scene: PendulumScene, times: FloatArray) -> FloatArray:
 
 
 def peak(times: FloatArray, values: FloatArray) -> float:
-    """Hz of the highest peak of the spectrum."""
+    """Frequency of the spectrum's highest peak, Hz."""
     grid = np.arange(0.1, 2.0, 1e-3)
     return float(grid[np.argmax(lombscargle(times, values - values.mean(), 2.0 * np.pi * grid))])
 
 
 def frequency(times: FloatArray, values: FloatArray) -> float:
-    """Hz, as ``evaluate baseline`` finds it."""
+    """Frequency as in ``evaluate baseline``, Hz."""
     return fit_swing(times, values, "sine").frequency
 
 
@@ -144,7 +144,7 @@ COMPARED: dict[str, Way] = {"without amplitude": _small, "even steps": _steps, "
 
 
 def pendulum(job: tuple[str, int]) -> dict[str, float]:
-    """One way to find the frequency, over all lengths, with as many seeds."""
+    """Errors of one method for the frequency, over all lengths, with this number of seeds."""
     name, seeds = job
     way, errors = (JUDGED | COMPARED)[name], []
     for length in LENGTHS:
@@ -162,7 +162,7 @@ def pendulum(job: tuple[str, int]) -> dict[str, float]:
 
 
 def floor() -> float:
-    """Millihertz, of a sinusoid of 5 degrees on the shortest pendulum with the noise in pixels."""
+    """Cramer-Rao bound of the frequency for a sinusoid of 5 degrees on the shortest pendulum with the noise, mHz."""
     scene = PendulumScene(min(LENGTHS))
     amplitude = scene.length * np.sin(np.radians(5.0)) / scene.distance * scene.camera.matrix[0, 0]
     samples = 0.9 * 30.0 * SECONDS
@@ -170,7 +170,7 @@ def floor() -> float:
 
 
 def vicon(data: Path) -> dict[str, dict[str, float]]:
-    """Per link; none where the recordings are absent."""
+    """Figures per link; empty where the recordings are absent."""
     found = {}
     for link in (1, 2, 3):
         path = data / "imu" / "pendulum_with_reference" / f"Pendulum_Test02a_Trial1_Segment_{link}.csv.gz"

@@ -1,14 +1,13 @@
-"""The simulated Kinect v2 beside what Schlagenhauf (2017) published of real ones.
+"""The simulated Kinect v2 beside published figures of real ones (Schlagenhauf 2017).
 
-Table E.1: her pipeline (``thesis_pipeline``) over her three motions in her layout 4, her female subject; its output,
-aligned with the truth in time and space as she did (section 5.7.1), and the mean absolute error of ten joints along x
-(across the person), y (forward) and z (up), LKF2. The median of simulated subjects of average build.
+Table E.1: her pipeline (``thesis_pipeline``) over her three motions in her layout 4, her female subject. Its output is
+aligned with the truth in time and space as in her section 5.7.1. Mean absolute error of ten joints along x (across the
+person), y (forward) and z (up), LKF2. The median over simulated subjects of average build.
 
 Table 4.4: one sensor, two motions at four yaws of the person; low-pass at 3 Hz (section 4.3.2); RMSE of the angle
-between forearm and upper arm, and of the shoulder's elevation. And the 3D error of the joints, which others report as
-50 to 101 mm.
+between forearm and upper arm, and of shoulder elevation. Also the 3D error of the joints; others report 50 to 101 mm.
 
-The parameters have been set from recordings of real pairs and of a Kinect beside Vicon; our own filters play no part.
+The parameters were fitted to recordings of real pairs and of a Kinect beside Vicon; our own filters were not used.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ E1: dict[Joint, tuple[float, float, float]] = {
 """Table E.1, LKF2: mean absolute errors along x, y, z, mm."""
 TEN = np.array(list(E1), dtype=np.intp)
 WITHIN = 0.25
-"""Share of her figure by which one of ours may be off."""
+"""Largest relative difference between our figure and hers."""
 
 YAWS = (0, 30, 60, 90)
 TABLE_4_4: dict[str, dict[str, tuple[float, float, float, float]]] = {
@@ -65,9 +64,9 @@ TABLE_4_4: dict[str, dict[str, tuple[float, float, float, float]]] = {
         "RS": (10.26, 4.81, 3.52, 54.10),
     },
 }
-"""Degrees, at each yaw."""
+"""RMSE at each yaw, degrees."""
 JOINT_ERROR = (50.0, 101.0)
-"""Millimetres: least and greatest 3D error that is reported of the joints of one sensor."""
+"""Millimetres: smallest and largest 3D error reported of the joints of one sensor."""
 
 _LOW_PASS = 3.0
 _SUBJECT = "female"
@@ -83,7 +82,7 @@ class Subject:
     """The ten joints of one subject over her three motions, in world.
 
     Attributes:
-        found: (n, 10, 3) metres, her output, NaN where unknown.
+        found: (n, 10, 3) output of her pipeline, metres; NaN where unknown.
         true: (n, 10, 3) metres.
     """
 
@@ -91,7 +90,7 @@ class Subject:
     true: FloatArray
 
     def mae(self) -> FloatArray:
-        """(10, 3) mm along the person's right, front and up."""
+        """(10, 3) mean absolute errors along the person's right, front and up, mm."""
         both = known(self.found) & known(self.true)
         rotation, translation = rigid_registration(self.true[both], self.found[both])
         apart = (self.found @ rotation.T + translation - self.true) @ _AXES.T
@@ -105,11 +104,11 @@ def _axes() -> FloatArray:
 
 
 _AXES = _axes()
-"""From world to the right, the front and up of a person in layout 4."""
+"""(3, 3) rotation from world to the right, front and up of a person in layout 4."""
 
 
 def subject(seed: int, errors: KinectErrors) -> Subject:
-    """Her LKF2 over her three motions, and the truth, at 100 Hz after a constant shift in time for each."""
+    """Her LKF2 over her three motions, and the truth, at 100 Hz after a constant shift in time for each motion."""
     found, true = [], []
     for motion in E1_MOTIONS:
         recording = _subject(motion, seed, errors)
@@ -140,7 +139,7 @@ class OneSensor:
 
 
 def one_sensor(motion: str, yaw: int, seed: int, errors: KinectErrors) -> OneSensor:
-    """A subject before one sensor, turned to the right by a yaw in degrees, so that the right arm is the far one."""
+    """A subject in front of one sensor, turned to the right by a yaw in degrees; the right arm is the far one."""
     recording = _subject(motion, seed, errors, layout=around((np.radians(yaw),)))
     pose = recording.sensors[0].pose
     placed = [
@@ -152,7 +151,7 @@ def one_sensor(motion: str, yaw: int, seed: int, errors: KinectErrors) -> OneSen
     times = grid(float(estimate.times[inside][0]), float(estimate.times[inside][-1]), 30.0)
     found, true = estimate.at(times, 10.0).positions, curve.at(times)
     there = known(found[:, TEN])
-    # low-pass over what is there; a joint that is missing for long is not compared there
+    # interpolate gaps for the low-pass; the 3D error is of known joints only
     filled = np.stack([_filled(times, found[:, joint]) for joint in range(N_JOINTS)], axis=1)
     b, a = butter(2, _LOW_PASS / 15.0)
     smooth = filtfilt(b, a, filled, axis=0)
@@ -183,7 +182,7 @@ def _angles(p: FloatArray) -> FloatArray:
 
 
 def table_e1(errors: KinectErrors, count: int) -> FloatArray:
-    """(10, 3) mm: the mean absolute errors of the median subject: hers had no luck or bad luck that we know of."""
+    """(10, 3) mean absolute errors of the median subject, mm; hers is taken for a typical one."""
     found = []
     for seed in range(count):
         found.append(subject(seed, errors).mae())
@@ -205,19 +204,19 @@ def main() -> int:
     text = page(mae, tables, args.subjects)
     common.report(args, {"E.1": mae, "4.4": tables}, lambda: print(text))
     if args.write:
-        # what ``simulated_pairs`` wrote there stays
+        # the section that ``simulated_pairs`` wrote stays
         kept = PAGE.read_text().partition(PAIRS)[1:] if PAGE.exists() else ()
         PAGE.write_text(f"{_HEAD}\n{text}\n{''.join(kept)}")
     return int(off_by_too_much(mae).any())
 
 
 def off_by_too_much(mae: FloatArray) -> BoolArray:
-    """(10, 3) which figures of table E.1 are off by more than they may be."""
+    """(10, 3) whether a figure of table E.1 differs by more than ``WITHIN``."""
     return np.abs(mae / np.array(list(E1.values())) - 1.0) > WITHIN
 
 
 def table_4_4(errors: KinectErrors, subjects: int) -> dict[str, dict[str, list[list[float]]]]:
-    """Per motion: "angles" (4 angles of 4 yaws, degrees, RMS over subjects) and "error" (3D of 4 yaws, mm)."""
+    """Per motion: "angles" (4 angles at 4 yaws, RMS over subjects, degrees) and "error" (3D at 4 yaws, mm)."""
     tables: dict[str, dict[str, list[list[float]]]] = {}
     for motion in TABLE_4_4:
         angles, distances = [], []

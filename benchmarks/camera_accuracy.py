@@ -1,19 +1,20 @@
-"""Two colour-and-depth cameras to joint angles, beside two Kinects, on simulated people whom nothing was tuned on.
+"""Two colour-and-depth cameras to joint angles, beside two Kinects, on simulated people on whom nothing was tuned.
 
 Both stand as in layout 4 of Schlagenhauf (2017): 2 m from the person, 45 degrees to each side. Kinects are simulated as
-in ``accuracy.py``, 30 frames a second; cameras see rendered images of 640x480 pixels, 15 a second, their depth with the
+in ``accuracy.py``, 30 frames a second; cameras see rendered images of 640x480 pixels, 15 a second, with the depth
 errors of a Kinect v2. Calibration, fusion and filter are those of the graph at its defaults.
 
-network    the landmarks that the network finds in the rendered images.
-published  the same, but each landmark is where the true joint is in the image, plus an error as published of
-           photographs: normal, so large that as many are within a fifth of the torso's diagonal (PCK@0.2) as the
-           authors of BlazePose Full state, mean of their three sets of images. Half of its variance persists per person
-           and camera, the other half has a time constant of half a second: both are assumptions.
+network    the network's landmarks in the rendered images.
+published  the same with other pixels: each landmark is at the projection of the true joint, plus an error as published
+           for photographs. The error is normal; its standard deviation gives the share of landmarks within a fifth of
+           the torso's diagonal (PCK@0.2) that the authors of BlazePose Full state, mean of their three sets of
+           images. Half of its variance persists per person and camera, the other half has a time constant of half a
+           second: both are assumptions.
 
-``joints``: mean 3D error of the joints of one sensor's skeleton, mm; ``inside``: the share of true joints inside the
-95 % ellipsoids that it states. The others are of the filtered skeleton as in ``accuracy.py``: mean 3D error of ten
+``joints``: mean 3D error of the joints of one sensor's skeleton, mm; ``inside``: the share of true joints inside its
+stated 95 % ellipsoids. The other columns evaluate the filtered skeleton as in ``accuracy.py``: mean 3D error of ten
 joints, mm, and without each joint's constant offset; RMSE of elevation and elbow flexion, degrees, and the share of
-frames in which they are within 1.96 stated deviations. ``--write`` writes the section of docs/accuracy.md.
+frames with errors within 1.96 stated standard deviations. ``--write`` writes the section of docs/accuracy.md.
 """
 
 from __future__ import annotations
@@ -54,11 +55,11 @@ PCK = 0.955, 0.963, 0.957
 """BlazePose Full: share of landmarks within a fifth of the torso's diagonal, in images of yoga, dance and HIIT (Google,
 MediaPipe Pose, "Pose estimation quality")."""
 PER_TORSO = 0.2 / float(np.sqrt(-2.0 * np.log(1.0 - np.mean(PCK))))
-"""Standard deviation of a normal error per axis that gives this share, in torsos."""
+"""Standard deviation per axis of a normal error with this share, in torso lengths."""
 PERSISTENT, TIME_CONSTANT = 0.5, 0.5
-"""Share of the variance that stays, and seconds of the rest."""
+"""Persistent share of the variance, and time constant of the rest, seconds."""
 DELAY_NS = round(0.06 * NANOSECONDS)
-"""From capture to the skeleton."""
+"""Delay from capture to receipt of the skeleton."""
 COLUMNS = {
     "error": "error",
     "fixed": "without offsets",
@@ -70,7 +71,7 @@ COLUMNS = {
 
 
 class PublishedErrors:
-    """Landmarks at the true joints with errors as published, of one person and camera."""
+    """Landmarks at the true joints with errors as published, for one person and camera."""
 
     def __init__(self, seed: int, number: int) -> None:
         self._rng = np.random.default_rng([seed, number, 2006])
@@ -79,7 +80,7 @@ class PublishedErrors:
         self._time: float | None = None
 
     def of(self, found: Landmarks, frame: DepthFrame, camera: Camera) -> Landmarks:
-        """``found`` with other pixels."""
+        """``found`` with pixels at the true joints plus errors."""
         kept = 0.0 if self._time is None else np.exp(-(frame.time - self._time) / TIME_CONSTANT)
         fresh = self._rng.normal(size=self._slow.shape)
         if self._time is not None:
@@ -94,14 +95,14 @@ class PublishedErrors:
 
 
 def marked(joints: FloatArray) -> FloatArray:
-    """(33, 3) where joints (25, 3) are marked by landmarks; NaN of those of the face and others that mark none."""
+    """(33, 3) positions of landmarks at joints (25, 3); NaN for landmarks that mark no joint, such as of the face."""
     places = np.full((len(Landmark), 3), np.nan)
     for side in ("LEFT", "RIGHT"):
         for name in ("SHOULDER", "ELBOW", "WRIST", "HIP", "KNEE", "ANKLE"):
             places[Landmark[f"{name}_{side}"]] = joints[Joint[f"{name}_{side}"]]
         places[Landmark[f"TOES_{side}"]] = joints[Joint[f"FOOT_{side}"]]
         places[Landmark[f"EAR_{side}"]] = joints[Joint.HEAD]
-        # a hand is taken to be at the mean of wrist and two fingers
+        # the hand joint is assumed at the mean of wrist and two fingers
         fingers = 0.5 * (3.0 * joints[Joint[f"HAND_{side}"]] - joints[Joint[f"WRIST_{side}"]])
         places[Landmark[f"INDEX_FINGER_{side}"]] = places[Landmark[f"LITTLE_FINGER_{side}"]] = fingers
     return places
@@ -110,7 +111,7 @@ def marked(joints: FloatArray) -> FloatArray:
 def seen_by_cameras(
     views: Sequence[Placed], model: PoseModel, seconds: float, step: int
 ) -> tuple[dict[str, list[RecordedFrame]], dict[str, dict[str, float]]]:
-    """Frames of both cameras by network and published errors; and the figures of the cameras' own skeletons."""
+    """Frames of both cameras by network and by published errors, and the figures of the cameras' own skeletons."""
     frames: dict[str, list[RecordedFrame]] = {NETWORK: [], PUBLISHED: []}
     errors: dict[str, list[FloatArray]] = {name: [] for name in frames}
     distances: dict[str, list[FloatArray]] = {name: [] for name in frames}
@@ -149,7 +150,7 @@ def seen_by_cameras(
 
 
 def errors_of(lifted: Lifted, true: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(n, 3) errors of the known joints, metres, and (n,) their squares in stated deviations."""
+    """(n, 3) errors of the known joints, metres, and (n,) their squared Mahalanobis distances."""
     known = np.isfinite(lifted.positions).all(axis=1)
     off = (lifted.positions - true)[known]
     squares = np.einsum("ji,jik,jk->j", off, np.linalg.inv(lifted.covariances[known]), off)
@@ -159,7 +160,7 @@ def errors_of(lifted: Lifted, true: FloatArray) -> tuple[FloatArray, FloatArray]
 def seen_by_kinects(
     views: Sequence[Placed], times: FloatArray, true: FloatArray
 ) -> tuple[list[RecordedFrame], dict[str, float]]:
-    """Frames of Kinects at the cameras' places; and the mean error of their own skeletons' joints."""
+    """Frames of Kinects at the cameras' poses, and the mean error of their own skeletons' joints."""
     frames: list[RecordedFrame] = []
     sizes = []
     misreading = Misreading.draw(np.random.default_rng([views[0].seed, 6]))
@@ -176,7 +177,7 @@ def seen_by_kinects(
 
 
 def figures_of(job: tuple[str, int, float, int]) -> dict[str, dict[str, float]]:
-    """One person in one motion: of each kind of sensor and filter all figures."""
+    """All figures by kind of sensor and filter, for one person in one motion."""
     motion, seed, seconds, step = job
     wheel = find_wheel()
     assert wheel is not None
@@ -203,7 +204,7 @@ def figures_of(job: tuple[str, int, float, int]) -> dict[str, dict[str, float]]:
         for label, skeletons in outputs.items():
             some = [each for each in skeletons if each.stamp_ns >= begin]
             poses = [view.pose for view in views]
-            # as `up` sets it
+            # as `up` sets the parameter
             of_bones = BONE_CORRELATION if name == KINECTS else 0.0
             figures = compared(some, poses, who.person.capsules(), curve, START_NS, of_bones)
             found[f"{name}, {label}"] = {**own[name], **{key: getattr(figures, key) for key in COLUMNS}}
@@ -219,7 +220,7 @@ def table(results: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str,
 
 
 def section(means: dict[str, dict[str, common.Mean]]) -> list[str]:
-    """Lines of the page."""
+    """Lines of the table in docs/accuracy.md."""
     lines = [
         "| | joints of one sensor | inside 95 % | " + " | ".join(COLUMNS.values()) + " |",
         "|---|" + "---:|" * (2 + len(COLUMNS)),

@@ -1,11 +1,11 @@
 """Live colour-and-depth cameras: images to joint angles through the nodes, one camera at 30 Hz and two at 15.
 
-The images of the shipped recording (480x360 pixels, JPEG; depth of half the size) are published reliably to the nodes,
-over and over. The delay is from just before the colour image is published until the angles of its stamp come, by
-one clock; ``beyond inference`` its median less the time that the networks take for such an image in this process alone,
-right before. ``lost``: images without angles; ``dropped``: images of either kind that the node's diagnostics count as
-dropped. ``cpu``: processor time of the camera node per pair of images that it uses, beside that of the networks alone,
-which other work on the machine changes less. The bars are meant for a machine that does nothing else.
+The images of the shipped recording (480x360 pixels, JPEG; depth at half the size) are published reliably to the nodes,
+over and over. The delay is from just before the colour image is published until the angles with its stamp are received,
+by one clock. ``beyond inference``: the median delay minus the networks' time for the images, measured in this process
+alone just before. ``lost``: images without angles; ``dropped``: images of either kind that the node's diagnostics count
+as dropped. ``cpu``: processor time of the camera node per pair of images that it uses, beside the networks' alone;
+other work on the machine changes it less. The bars assume a machine that does nothing else.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ NODE = "camera_skeleton"
 
 
 def recorded() -> tuple[list[tuple[str, bytearray]], list[dict[str, bytearray]]]:
-    """Calibrations, and pairs of images, of the recording's camera: messages by the name of their field."""
+    """CameraInfo messages, and pairs of images, of the recording's camera, as CDR by kind."""
     names = DRIVERS["plain"].of("camera1")
     infos: list[tuple[str, bytearray]] = []
     images: dict[str, list[bytearray]] = {"colour": [], "depth": []}
@@ -57,7 +57,7 @@ def recorded() -> tuple[list[tuple[str, bytearray]], list[dict[str, bytearray]]]
 
 
 def inference_ms(pairs: list[dict[str, bytearray]]) -> tuple[float, float]:
-    """Median milliseconds, of wall and processor, of the networks for an image in which the person is followed."""
+    """Median wall and processor time of the networks for an image in which the person is tracked, milliseconds."""
     tracker, times = PersonTracker(PoseModel(default_folder()), 1, 0.3), []
     for number, pair in enumerate(pairs[:60]):
         _, _, image = CompressedColour().decode(bytes(pair["colour"]), BAG_WIRE)
@@ -74,7 +74,7 @@ def used_pairs(bench: live.Bench) -> float:
 
 
 def measured(cameras: int, rate: float, seconds: float, warm_up: float) -> dict[str, Any]:
-    """One run with so many cameras."""
+    """One run with this number of cameras."""
     infos, pairs = recorded()
     networks, networks_cpu = inference_ms(pairs)
     names = [f"camera{number + 1}" for number in range(cameras)]

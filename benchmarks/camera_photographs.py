@@ -1,11 +1,11 @@
 """People in real images: a Kinect's frame with its joints, a video of pedestrians, a portrait without legs.
 
-- kinect: the frame of ``kinect_depth``, in which 22 joints that a Kinect v2 reported are drawn as dots without names;
-  distance to the joints that we find, paired one to one, across the line of sight at our depth.
-- walkers, with --video, such as ``vtest.avi`` of Debian's package ``opencv-doc``: how long each pedestrian is followed
-  from image to image under one number.
+- kinect: the frame of ``kinect_depth``, in which the 22 joints reported by a Kinect v2 are drawn as unnamed dots;
+  distance of each dot to one of our joints, paired one to one, across the line of sight at our depth.
+- walkers, with --video, such as ``vtest.avi`` of Debian's package ``opencv-doc``: how long each pedestrian is tracked
+  from image to image with one number.
 - portrait, with --portrait, such as ``skimage/data/astronaut.png`` of PyPI's ``scikit-image``: joints that are tracked
-  where the image ends at the hips; the depth is taken to be the same everywhere.
+  where the image ends at the hips; the depth is assumed constant.
 
 --draw FOLDER writes images with the landmarks drawn in.
 """
@@ -31,13 +31,13 @@ from body_tracking.core.skeleton import NANOSECONDS, Joint, TrackingState
 from body_tracking.mesh.depth import to_metres
 
 KINECT_FOCAL, KINECT_CENTRE = 365.5, (256.0, 208.0)
-"""Of the real frame's depth camera, pixels, nominal."""
+"""Nominal intrinsics of the real frame's depth camera, pixels."""
 KINECT_BAR_MM = 60.0
 WALKER_BAR_S = 10.0
 NOBODYS = 0.15
-"""Metres from which on a dot belongs to no joint of ours."""
+"""Distance in metres beyond which a dot belongs to none of our joints."""
 FOLLOWED = 3.0
-"""Seconds from which on a pedestrian counts as followed."""
+"""Seconds after which a pedestrian counts as tracked."""
 LEGS = [Joint[f"{name}_{side}"] for name in ("KNEE", "ANKLE", "FOOT") for side in ("LEFT", "RIGHT")]
 UPPER = [Joint[f"{name}_{side}"] for name in ("SHOULDER", "ELBOW") for side in ("LEFT", "RIGHT")]
 
@@ -51,7 +51,7 @@ def read(path: Path) -> ImageArray:
 
 
 def camera_of(image: ImageArray, focal: float, centre: tuple[float, float] | None = None) -> Camera:
-    """A camera without distortion; its principal point in the middle where none is given."""
+    """A camera without distortion; the default principal point is the centre of the image."""
     height, width = image.shape[:2]
     x, y = centre or ((width - 1) / 2.0, (height - 1) / 2.0)
     matrix = np.array([[focal, 0.0, x], [0.0, focal, y], [0.0, 0.0, 1.0]])
@@ -59,7 +59,7 @@ def camera_of(image: ImageArray, focal: float, centre: tuple[float, float] | Non
 
 
 def person_in(model: PoseModel, image: ImageArray) -> Landmarks:
-    """The landmarks of the person in an image, after three passes as in a video of it."""
+    """The landmarks of the person in an image, after three updates as in a video."""
     tracker = PersonTracker(model, 1, 0.0)
     people: dict[int, Landmarks] = {}
     for stamp_ns in range(3):
@@ -68,24 +68,24 @@ def person_in(model: PoseModel, image: ImageArray) -> Landmarks:
 
 
 def kinect(model: PoseModel, folder: Path, joints: bool) -> tuple[dict[str, float], ImageArray]:
-    """The distances to the Kinect's joints, mm, and the image with the landmarks."""
+    """Distances to the Kinect's joints, mm, and the image with the landmarks."""
     image = read(folder / "lab_004378_color.png")
     depth = to_metres(cv2.imread(str(folder / "lab_004378_depth.png"), cv2.IMREAD_UNCHANGED))
     dots = ((image[..., 0] < 60) & (image[..., 1] > 190) & (image[..., 2] > 190)).astype(np.uint8)
     _, _, stats, centres = cv2.connectedComponentsWithStats(dots)
     places = centres[1:][stats[1:, cv2.CC_STAT_AREA] >= 2]
     camera = camera_of(image, KINECT_FOCAL, KINECT_CENTRE)
-    # the dots hide the person from the network, as no camera does
+    # remove the dots: they hide the person from the network, and no camera draws any
     clean: ImageArray = cv2.inpaint(image, cv2.dilate(dots, np.ones((3, 3), np.uint8)), 3, cv2.INPAINT_TELEA)
     found = person_in(model, clean)
     lifted = lift(found, depth, camera)
     assert lifted is not None
     known = np.flatnonzero(np.isfinite(lifted.positions).all(axis=1))
     ours = lifted.positions[known]
-    # a dot states no depth: it is compared at the depth of the joint that it is paired with
+    # a dot has no depth: compare it at the depth of the paired joint
     rays = np.column_stack([camera.undistort(places), np.ones(len(places))])
     apart = np.linalg.norm(rays[:, None] * ours[None, :, 2:] - ours[None], axis=2)
-    # a dot that is nobody's, as of the Kinect's knees in this frame, must not push the others to wrong joints
+    # a dot without a joint of ours (here the Kinect's knees) must not push the others to wrong joints
     rows, columns = linear_sum_assignment(np.minimum(apart, NOBODYS))
     away = 1e3 * apart[rows, columns]
     if joints:
@@ -101,7 +101,7 @@ def kinect(model: PoseModel, folder: Path, joints: bool) -> tuple[dict[str, floa
 
 
 def walkers(model: PoseModel, path: Path) -> tuple[dict[str, dict[str, float]], ImageArray]:
-    """From when to when each pedestrian is followed, s, and an image with some of them."""
+    """Start and end of each pedestrian's track, s, and an image with most of them."""
     video = cv2.VideoCapture(str(path))
     rate = video.get(cv2.CAP_PROP_FPS)
     if not video.isOpened() or not rate > 0.0:

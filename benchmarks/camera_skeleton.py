@@ -1,11 +1,11 @@
 """Skeletons of a colour-and-depth camera on simulated people in rendered images, beside those of a simulated Kinect.
 
-The network sees rendered images of MakeHuman's people in clothes whom nothing was fitted to; the depth images have the
-errors of a Kinect v2. Errors of shoulders, elbows and wrists against the true joints as they are, and without each
-joint's constant offset; share of true joints inside of the stated 95 % ellipsoid, and mean squared error in stated
-deviations per axis. With --pair by two such cameras without depth, 69 degrees apart.
+The network sees rendered images of MakeHuman's clothed people, on whom nothing was tuned; the depth images have the
+errors of a Kinect v2. Errors of shoulders, elbows and wrists against the true joints, and without each joint's constant
+offset; share of true joints inside the stated 95 % ellipsoid, and normalised squared error (NEES) per axis. With
+--pair, two colour cameras without depth, 69 degrees apart, take the place of the camera with depth.
 
---ablation leaves out one mechanism of ``camera.lifting`` at a time, in the same images.
+--ablation leaves out one mechanism of ``camera.lifting`` at a time, on the same images.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ from body_tracking.simulation.people import Course
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed(DepthScene):
-    """A person and a motion before one of the sensors of a layout; ``world`` is that of the layout.
+    """A person and a motion in front of one of the sensors of a layout; ``world`` is that of the layout.
 
     Attributes:
         where: the layout.
-        number: of the sensor.
+        number: of the sensor in the layout.
     """
 
     where: Layout = field(default_factory=lambda: layout(4))
@@ -62,14 +62,14 @@ class Placed(DepthScene):
         return movement.course(inside).placed(self.where.position, self.where.yaw)
 
     def room(self) -> tuple[FloatArray, Any]:
-        """The usual room, before this sensor."""
+        """The usual room, in front of this sensor."""
         return DepthScene(self.who, self.motion, camera=self.camera).room()
 
 
 MOTIONS = ("arm_raises", "reaching", "torso_twist", "walking_and_turning", "two_handed_wave", "squat")
 ARMS = [Joint[f"{name}_{side}"] for side in ("LEFT", "RIGHT") for name in ("SHOULDER", "ELBOW", "WRIST")]
 INSIDE = 7.815
-"""95 % of a chi-squared distribution with three degrees of freedom."""
+"""95 % quantile of a chi-squared distribution with three degrees of freedom."""
 ALL = "nothing"
 
 
@@ -80,7 +80,7 @@ def _without_scatter(*args: Any) -> tuple[FloatArray, FloatArray]:
 
 _SURFACES = lifting._surfaces
 _SURE = "_SURE"
-"""Landmarks that the network guesses are lifted like others."""
+"""Key of the ablation that lifts landmarks guessed by the network like seen ones."""
 ABLATION: Mapping[str, Mapping[str, Any]] = {
     ALL: {},
     "surface only near the expected depth": {"_EXPECTED": np.inf},
@@ -96,7 +96,7 @@ ABLATION: Mapping[str, Mapping[str, Any]] = {
     "spine in the trunk's mask": {"_SPINE": 0.0},
     "far shoulder and hip by the near ones": {"_TURNED": (10.0, 11.0)},
 }
-"""Mechanisms of the lifting, and the names in ``camera.lifting`` whose other values leave each of them out."""
+"""Mechanisms of the lifting, and for each the values of names in ``camera.lifting`` that leave it out."""
 
 
 @dataclass(frozen=True)
@@ -105,11 +105,11 @@ class Run:
 
     Attributes:
         errors: (n, 25, 3) metres; NaN where not tracked.
-        distances: (n, 25) squared errors in stated deviations.
+        distances: (n, 25) squared Mahalanobis distances of the errors.
         seen: (n, 25) whether the joint is stated to be tracked.
-        kinect: (n, 25, 3) errors of the Kinect's skeleton in the same frames.
-        images: number of them.
-        seconds: of a processor, for all.
+        kinect: (n, 25, 3) errors of the Kinect's skeleton in the same frames, metres.
+        images: number of images.
+        seconds: processor time for all images.
     """
 
     errors: FloatArray
@@ -121,7 +121,7 @@ class Run:
 
 
 class WithDepth:
-    """A colour-and-depth camera at the place of the scene's own."""
+    """A colour-and-depth camera at the pose of the scene's own."""
 
     def __init__(self, scene: DepthScene, model: PoseModel) -> None:
         self._camera, self._painter, self._tracker = scene.camera, Painter.of(scene), PersonTracker(model, 1, 0.3)
@@ -134,12 +134,12 @@ class WithDepth:
         return people[0] if people and not is_flat(people[0], images[1], self._camera) else None
 
     def joints(self, landmarks: Landmarks, images: Any) -> Lifted | None:
-        """In the scene's optical frame."""
+        """Joints in the scene's optical frame."""
         return lift(landmarks, images[1], self._camera)
 
 
 class Pair:
-    """Two colour cameras at the sides."""
+    """Two colour cameras, one to each side."""
 
     def __init__(self, scene: DepthScene, model: PoseModel) -> None:
         poses = [pose_around(f"camera{number + 1}", angle) for number, angle in enumerate((-0.6, 0.6))]
@@ -158,7 +158,7 @@ class Pair:
         return matched[0] if matched else None
 
     def joints(self, views: list[View], images: Any) -> Lifted | None:
-        """In the scene's optical frame."""
+        """Joints in the scene's optical frame."""
         body, turn = triangulate(self._rig, views), self._rotation
         return Lifted(body.positions @ turn.T + self._shift, body.states, turn @ body.covariances @ turn.T)
 
@@ -177,7 +177,7 @@ def without(name: str, source: WithDepth | Pair, landmarks: Any, images: Any) ->
 def runs_of(
     scene: DepthScene, model: PoseModel, seconds: float, step: int, pair: bool, variants: Sequence[str] = (ALL,)
 ) -> dict[str, Run]:
-    """One person in one motion, without each of some mechanisms in turn; the first one is timed."""
+    """One person in one motion, with each of these mechanisms left out in turn; the first variant is timed."""
     source: WithDepth | Pair = Pair(scene, model) if pair else WithDepth(scene, model)
     found: dict[str, list[Lifted]] = {name: [] for name in variants}
     times, truth = [], []
@@ -189,7 +189,7 @@ def runs_of(
         landmarks: Any = source.landmarks(round(frame.time * NANOSECONDS), taken)
         first = None if landmarks is None else without(variants[0], source, landmarks, taken)
         spent += time.process_time() - begun
-        # whether there is depth at the trunk is the same for all of them
+        # all variants have the same depth at the trunk: either all are lifted or none
         lifted = [first, *(without(name, source, landmarks, taken) for name in variants[1:] if first is not None)]
         if any(each is None for each in lifted):
             continue
@@ -204,7 +204,7 @@ def runs_of(
 
 
 def run_of(lifted: Sequence[Lifted], true: FloatArray, kinect: FloatArray, images: int, spent: float) -> Run:
-    """The figures of some frames with true joints (n, 25, 3)."""
+    """The figures of frames with true joints (n, 25, 3)."""
     error = np.array([each.positions for each in lifted]) - true
     covariances = np.array([each.covariances for each in lifted])
     inverse = np.linalg.inv(np.where(np.isfinite(covariances), covariances, np.eye(3)))
@@ -214,7 +214,7 @@ def run_of(lifted: Sequence[Lifted], true: FloatArray, kinect: FloatArray, image
 
 
 def kinect_errors(scene: DepthScene, times: FloatArray, true: FloatArray) -> FloatArray:
-    """(n, 25, 3) errors of a simulated Kinect's joints at the place of the camera; NaN where it tracks none."""
+    """(n, 25, 3) errors of a simulated Kinect's joints at the camera's pose, metres; NaN where not tracked."""
     sensor = SimulatedKinect(scene.pose, ClockModel())
     rng = np.random.default_rng([scene.seed, 3])
     misreading = Misreading.draw(np.random.default_rng([scene.seed, 6]))
@@ -224,7 +224,7 @@ def kinect_errors(scene: DepthScene, times: FloatArray, true: FloatArray) -> Flo
 
 
 def sizes(errors: FloatArray, *, moved: bool) -> FloatArray:
-    """(n, 25) mm, without each joint's constant offset where ``moved``."""
+    """(n, 25) lengths of errors, mm; without each joint's constant offset if ``moved``."""
     known = np.isfinite(errors).any(axis=(0, 2))
     offset = np.zeros(errors.shape[1:])
     if moved:
@@ -299,7 +299,7 @@ def main() -> int:
 
 
 def row(name: str, runs: list[Run]) -> None:
-    """Print one row; means over the people's frames."""
+    """Print one row: means over all frames of the runs."""
 
     def mean(moved: bool, kinect: bool, joints: Any) -> float:
         found = [sizes(each.kinect if kinect else each.errors, moved=moved)[:, joints].ravel() for each in runs]

@@ -1,6 +1,6 @@
-"""What benchmarks share: options, real recordings, parallel runs, statistics, tables and verdicts.
+"""Shared by the benchmarks: options, real recordings, parallel runs, statistics, tables and verdicts.
 
-Imported before numpy: each of several runs beside each other has one thread.
+Import it before numpy: it limits numpy to one thread per process, as several runs work in parallel.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from body_tracking.core.skeleton import FloatArray
 
 ROOT = Path(__file__).resolve().parent.parent
 DATA = Path(os.environ.get("BODY_TRACKING_DATA", ROOT.parent / "shared" / "data"))
-"""The real recordings."""
+"""Folder of the real recordings."""
 ABSENT = 2
 """Exit code where real recordings are absent."""
 NORMAL = 1.959964
-"""Of a normal distribution 95 % lies within so many standard deviations."""
+"""A normal distribution has 95 % of its mass within this number of standard deviations."""
 
 _Job, _Result = TypeVar("_Job"), TypeVar("_Result")
 
@@ -43,13 +43,13 @@ _Job, _Result = TypeVar("_Job"), TypeVar("_Result")
 def parser(
     doc: str | None, *, seeds: int = 0, motions: Sequence[str] = (), jobs: bool = False, data: bool = False
 ) -> argparse.ArgumentParser:
-    """A command line with the usual options, those of the arguments that are given.
+    """A command line with the shared options that the arguments select.
 
     Args:
-        doc: the benchmark's own text.
-        seeds: default of ``--seeds``.
-        motions: default of ``--motions``.
-        jobs: whether it runs on several processes.
+        doc: docstring of the benchmark, for its help.
+        seeds: default of ``--seeds``; 0 for no such option.
+        motions: default of ``--motions``; empty for no such option.
+        jobs: whether the benchmark runs in several processes.
         data: whether it reads real recordings.
     """
     found = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -81,12 +81,12 @@ def parser(
 
 
 def names(text: str) -> list[str]:
-    """``A,B`` of a command line."""
+    """Parse ``A,B`` of a command line."""
     return [name for name in text.split(",") if name]
 
 
 def assignment(text: str) -> tuple[str, bool | float]:
-    """``name=value`` of a command line, a number, ``true`` or ``false``."""
+    """Parse ``name=value`` of a command line; the value is a number, ``true`` or ``false``."""
     name, _, value = text.partition("=")
     try:
         found = json.loads(value)
@@ -96,7 +96,7 @@ def assignment(text: str) -> tuple[str, bool | float]:
 
 
 def add_set(found: argparse.ArgumentParser) -> None:
-    """``--set`` of parameters of the filter."""
+    """Add ``--set`` for parameters of the filter."""
     found.add_argument(
         "--set",
         type=assignment,
@@ -108,10 +108,10 @@ def add_set(found: argparse.ArgumentParser) -> None:
 
 
 def recordings(folder: Path, names: Iterable[str]) -> list[Path]:
-    """The files of real recordings.
+    """Paths of real recordings.
 
     Raises:
-        SystemExit: one is absent; the code is ``ABSENT``.
+        SystemExit: a file is missing; the exit code is ``ABSENT``.
     """
     files = [folder / name for name in names]
     if not files or not all(file.is_file() for file in files):
@@ -124,7 +124,7 @@ def recordings(folder: Path, names: Iterable[str]) -> list[Path]:
 
 
 def attempt(work: Callable[[_Job], _Result], job: _Job) -> tuple[_Result | None, str]:
-    """The result of a job, or what went wrong: whatever a filter raises is a finding, not the end of a benchmark."""
+    """The result of a job, or its traceback: an exception in a filter is a finding and must not end the benchmark."""
     try:
         return work(job), ""
     except Exception:
@@ -132,14 +132,14 @@ def attempt(work: Callable[[_Job], _Result], job: _Job) -> tuple[_Result | None,
 
 
 def progress(text: str) -> None:
-    """A line for whoever waits."""
+    """Print a line about the progress to stderr."""
     print(text, file=sys.stderr, flush=True)
 
 
 def mapped(work: Callable[[_Job], _Result], jobs: Sequence[_Job], processes: int) -> list[_Result]:
-    """The results of all jobs, in their order; shows how far it is."""
+    """The results of all jobs, in their order; prints the progress."""
     began, results = time.monotonic(), []
-    # processes that may have children: `replay` runs in two
+    # no daemonic processes: `replay` starts a child process
     with ProcessPoolExecutor(max(1, min(processes, len(jobs))), multiprocessing.get_context("spawn")) as pool:
         for result in pool.map(work, jobs):
             results.append(result)
@@ -153,18 +153,18 @@ def mapped(work: Callable[[_Job], _Result], jobs: Sequence[_Job], processes: int
 
 
 def rms(values: FloatArray) -> float:
-    """Root of the mean square of what is finite; NaN of nothing."""
+    """Root mean square of the finite values; NaN without any."""
     finite = values[np.isfinite(values)]
     return float(np.sqrt((finite**2).mean())) if finite.size else float("nan")
 
 
 def rms_deg(radians: FloatArray) -> float:
-    """The same of angles, in degrees."""
+    """RMS of angles in radians, as degrees."""
     return float(np.degrees(rms(radians)))
 
 
 def bone_correlation(errors: FloatArray, joints: Sequence[int]) -> float:
-    """Correlation of the errors of the joints at the two ends of a bone, over its axes, as ``joint_angles`` takes it.
+    """Correlation of the errors at the two ends of a bone, over its axes, as ``joint_angles`` assumes it.
 
     Args:
         errors: (n, k, 3); NaN where a joint is not tracked.
@@ -178,14 +178,14 @@ def bone_correlation(errors: FloatArray, joints: Sequence[int]) -> float:
 
 
 def between(a: FloatArray, b: FloatArray) -> FloatArray:
-    """(...) radians between vectors (..., 3)."""
+    """(...) angles between vectors (..., 3), radians."""
     angle: FloatArray = np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(axis=-1))
     return angle
 
 
 @dataclass(frozen=True, slots=True)
 class Mean:
-    """A mean, half the width of its 95 % confidence interval (Student; NaN of one alone), and of how many it is."""
+    """A mean, half the width of its 95 % confidence interval (Student; NaN for one value), and the number of values."""
 
     value: float
     half: float
@@ -193,7 +193,7 @@ class Mean:
 
     @classmethod
     def of(cls, values: Iterable[float]) -> Mean:
-        """Over those that are finite."""
+        """Mean over the finite values."""
         finite = np.array([value for value in values if np.isfinite(value)])
         count = len(finite)
         half = float("nan")
@@ -206,7 +206,7 @@ class Mean:
 
 
 def report(args: argparse.Namespace, figures: Any, show: Callable[[], None] | None = None) -> None:
-    """Print figures as tables (or what ``show`` prints), or as JSON, or write them to a file, as ``--out`` asks."""
+    """Print figures as tables (or by ``show``) or as JSON, or write them to a file, as ``--out`` selects."""
     text = json.dumps(figures, indent=2, default=_plain)
     if prints_json(args):
         print(text)
@@ -220,7 +220,7 @@ def report(args: argparse.Namespace, figures: Any, show: Callable[[], None] | No
 
 
 def tables(figures: Any, title: str = "") -> Iterator[str]:
-    """Lines that show plain figures (of JSON): mappings of values as rows of a table, what is deeper below titles."""
+    """Lines of tables of figures (from JSON): mappings of values as rows, deeper levels below titles."""
     if isinstance(figures, list):
         figures = {str(number): each for number, each in enumerate(figures, 1)}
     figures = {name: each for name, each in figures.items() if each != {}}
@@ -241,7 +241,7 @@ def tables(figures: Any, title: str = "") -> Iterator[str]:
 
 
 def _table(title: str, rows: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
-    """An empty line, the title and the names of columns, and the rows; numbers to the right, texts to the left."""
+    """An empty line, title and column names, and the rows; numbers aligned right, texts left."""
     columns = list(dict.fromkeys(column for row in rows.values() for column in row))
     cells = [
         [title, *columns],
@@ -256,7 +256,7 @@ def _table(title: str, rows: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
 
 
 def _is_value(each: Any) -> bool:
-    """A number, a text, a mean, or a list of numbers and texts."""
+    """Whether this is a number, a text, a mean, or a list of numbers and texts."""
     if isinstance(each, dict):
         return each.keys() == {"value", "half", "count"}
     return not isinstance(each, list) or not any(isinstance(item, dict | list) for item in each)
@@ -273,7 +273,7 @@ def _cell(value: Any) -> str:
 
 
 def prints_json(args: argparse.Namespace) -> bool:
-    """Whether nothing but JSON is to be printed."""
+    """Whether only JSON is printed."""
     return str(args.out) == "-"
 
 
@@ -286,7 +286,7 @@ def _plain(value: Any) -> Any:
 
 
 def verdicts(args: argparse.Namespace, met: Mapping[str, bool]) -> int:
-    """Print each bar, whether it is met; the exit code: 1 where one is missed."""
+    """Print for each bar whether it is met; returns the exit code, 1 if one is missed."""
     for name, is_met in met.items():
         text = f"  {'met   ' if is_met else 'MISSED'}  {name}"
         print(text, file=sys.stderr if prints_json(args) else sys.stdout)

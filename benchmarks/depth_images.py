@@ -1,9 +1,10 @@
 """A real depth image of a Kinect v2 beside simulated ones, and the time of each step of the depth input.
 
-``noise`` is the standard deviation from the second differences of neighbours, by distance; ``holes`` the share of
-missing pixels of the image; ``outline zeros`` that within 2 pixels of the person's outline; ``rim`` the share of the
-pixels at the rim of the person's mask whose depth is more than 40 mm from that of the mask two pixels inside. ``rim
-kept`` and ``inside kept`` say what the rejection of flying pixels leaves of them.
+``noise`` is the standard deviation from second differences of neighbours, by distance; ``holes`` the share of missing
+pixels of the image; ``outline zeros`` the share within 2 pixels of the person's outline; ``rim`` the share of the
+pixels at the rim of the person's mask whose depth differs by more than 40 mm from the mask two pixels inside. ``rim
+kept`` and ``inside kept`` are the shares of those pixels, and of the pixels inside, left after rejection of flying
+pixels.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ MOTIONS = ("two_handed_wave", "walking_and_turning", "reaching")
 
 
 def statistics(depth: SingleArray, mask: BoolArray) -> dict[str, float]:
-    """The figures of one image and the person's mask."""
+    """The figures of one image with the person's mask."""
     there = depth > 0.0
     second = np.abs(depth[:, 2:] - 2.0 * depth[:, 1:-1] + depth[:, :-2]).astype(float)
     whole = there[:, 2:] & there[:, 1:-1] & there[:, :-2]
@@ -61,7 +62,7 @@ def statistics(depth: SingleArray, mask: BoolArray) -> dict[str, float]:
 
 
 def median_ms(step: Callable[[], Any], repeats: int = 30) -> float:
-    """CPU time, milliseconds; the first call compiles."""
+    """Median CPU time of a step, milliseconds, after a first call that compiles."""
     step()
     times = []
     for _ in range(repeats):

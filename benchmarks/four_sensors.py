@@ -1,13 +1,14 @@
-"""Four sensors of 30 Hz live through the graph: what is lost, what each node costs, and how late its output is.
+"""Four sensors of 30 Hz live through the graph: lost frames, processor time of each node, and delay of its output.
 
-A person is simulated who twists as in a shipped bag, seen by four Kinects that run on clocks of their own and deliver
-after different times, so that many frames come after later ones of other sensors. ``body_tracking up`` plays them at
-their times through four sensor nodes; the filter ``ekf`` takes each frame by itself, best effort as by default.
+A simulated person twists the trunk as in a shipped bag. Four Kinects see it; they run on their own clocks and deliver
+with different delays, so that many frames arrive after later ones of other sensors. ``body_tracking up`` plays them in
+real time through four sensor nodes; the filter ``ekf`` takes each frame by itself, best effort as by default.
 
-All is measured from outside: frames by the recording and by ``/diagnostics``, processor time of each process over the
-steady part, delays by the capture stamps of what this process receives, from capture and from delivery. A frame that
-comes after a later one has no output of its own: the filter takes the later ones again with it. What the filter takes
-is counted as if it had an output for every frame. The bars are meant for a machine that does nothing else.
+All figures are measured from outside: frames by the recording and by ``/diagnostics``, processor time of each process
+over the steady part, delays from the capture stamps to the receipt in this process, since capture and since delivery. A
+frame that arrives after a later one has no output of its own: the filter takes it and then the later ones again. The
+filter's processor time is scaled as if it had an output for every frame. The bars assume a machine that does nothing
+else.
 """
 
 from __future__ import annotations
@@ -37,21 +38,21 @@ from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS, Setup, Si
 
 FILTER = "ekf"
 LIMIT = 0.30
-"""Share of one core that the filter node may take."""
+"""Largest share of one core for the filter node."""
 
 SETTLE, TAIL = 7.0, 2.5
-"""Seconds before the steady part, in which person and sensors become known, and after it."""
+"""Seconds before the steady part, for initialisation of person and sensors, and after it."""
 
 START_AFTER = 12.0
-"""Seconds until the sensors deliver: every node is there by then."""
+"""Seconds until the sensors deliver; every node is up by then."""
 
 SEED = 4
 _LAYOUT = around(np.radians([45.0, -45.0, 0.0, -80.0]).tolist(), (2.0, 2.0, 2.4, 2.2), (1.0, 1.0, 1.25, 0.9))
 """The two sensors of the shipped bags, one in front of the person and one far to the right."""
 _DELAYS = ((0.022, 0.003), (0.034, 0.004), (0.028, 0.003), (0.045, 0.006))
-"""Seconds that each sensor takes to deliver: at least, and more on average."""
+"""Delivery delay of each sensor, seconds: the least, and the mean of the random rest."""
 
-# Frames that the filter was given and did not take, by its counters.
+# The filter's counters of rejected frames.
 _REFUSED = ("too_late", "repeated_stamps", "alignment uncalibrated", "alignment other_clock", "malformed", "refused")
 
 
@@ -59,11 +60,11 @@ _REFUSED = ("too_late", "repeated_stamps", "alignment uncalibrated", "alignment 
 
 
 def simulate(duration: float) -> SimulatedRecording:
-    """The recording; the same numbers each time."""
+    """The recording; the same at each call."""
     setup = Setup("torso_twist", _LAYOUT, seconds=duration, seed=SEED, standard=True)
     frames: list[RecordedFrame] = []
     for pose, (least, more) in zip(_LAYOUT.poses, _DELAYS, strict=True):
-        # errors of one sensor change nothing of the others: of each recording the sensor that it is about
+        # one sensor's errors do not change the others: take from each recording the sensor with these errors
         errors = KinectErrors(delay=least, delay_jitter=more)
         recording = scene.simulate(replace(setup, errors=errors))
         frames += [frame for frame in recording.frames if frame.sensor == pose.sensor]
@@ -72,13 +73,13 @@ def simulate(duration: float) -> SimulatedRecording:
 
 
 def captures(recording: SimulatedRecording) -> list[int]:
-    """Nanoseconds after the start at which each frame was taken."""
+    """Capture time of each frame, nanoseconds after the start."""
     clocks = {sensor.pose.sensor: sensor.clock for sensor in recording.sensors}
     return [clocks[each.sensor].to_reference(each.skeletons[0].stamp_ns) - START_NS for each in recording.frames]
 
 
 def disorder(taken: Sequence[int]) -> int:
-    """How many frames are delivered after later ones."""
+    """Number of frames delivered after later ones."""
     return sum(any(other > each for other in taken[max(0, k - 40) : k]) for k, each in enumerate(taken))
 
 
@@ -86,7 +87,7 @@ def disorder(taken: Sequence[int]) -> int:
 
 
 def up_command(folder: Path, recording: SimulatedRecording, start: float) -> list[str]:
-    """``body_tracking up`` with four sensor nodes that begin to play at a wall time."""
+    """Command line of ``body_tracking up`` with four sensor nodes that begin to play at this wall time, seconds."""
     bag = folder / "bag"
     write_bag(recording, bag)
     poses = {sensor.pose.sensor: sensor.pose for sensor in recording.sensors}
@@ -99,7 +100,7 @@ def up_command(folder: Path, recording: SimulatedRecording, start: float) -> lis
 
 
 def listen(ear: live.Ear, wall: float, alive: Callable[[], bool]) -> None:
-    """Until a wall time."""
+    """Spin until this wall time, seconds."""
     while time.time() < wall:
         if not alive():
             raise SystemExit("four_sensors: the graph ended too early")
@@ -107,7 +108,7 @@ def listen(ear: live.Ear, wall: float, alive: Callable[[], bool]) -> None:
 
 
 def _machine() -> FloatArray:
-    """(2,) seconds that all processors have worked, for anybody, and that the host has kept from them."""
+    """(2,) seconds of work of all processors for any process, and seconds stolen by the host."""
     times = psutil.cpu_times()
     return np.array([sum(times[:3]), times.steal])  # user, nice, system
 
@@ -141,7 +142,7 @@ def measure(seconds: float) -> dict[str, Any]:
         busy, stolen = (_machine() - machine) / elapsed
         others = max(0.0, busy - sum(float(each.sum()) for each in used.values()) / elapsed)
         share = {name: float(used[name].sum()) / elapsed for name in processes}
-        # The last frame is through, and everybody has reported once more.
+        # the last frame is through, and all nodes have published diagnostics once more
         listen(ear, start + max(_delivered(frame) for frame in recording.frames) / NANOSECONDS + 2.5, alive)
     if "skeleton_filter" not in share or "skeleton_filter" not in ear.statuses:
         raise SystemExit("four_sensors: the filter node was not there")
@@ -169,7 +170,7 @@ def measure(seconds: float) -> dict[str, Any]:
 
 
 def _sensor_rows(recording: SimulatedRecording, taken: list[int], ear: live.Ear) -> dict[str, dict[str, float]]:
-    """Of each sensor: frames and delays."""
+    """Frames and delays per sensor."""
     rows = {}
     for sensor in recording.sensors:
         name = sensor.pose.sensor
@@ -186,14 +187,14 @@ def _sensor_rows(recording: SimulatedRecording, taken: list[int], ear: live.Ear)
 
 
 def _delivered(frame: RecordedFrame) -> int:
-    """Nanoseconds after the start."""
+    """Receipt time, nanoseconds after the start."""
     return frame.received_ns - RECEIVED_FROM_NS
 
 
 def _delays(
     recording: SimulatedRecording, taken: list[int], ear: live.Ear, start: float, begin: float, end: float
 ) -> dict[str, dict[str, float]]:
-    """Of each output, in the steady part: how many, and how long after capture and after delivery."""
+    """Per output, in the steady part: number of messages, and their delays since capture and since delivery."""
     order = np.argsort(taken)
     times = np.array(taken)[order]
     delivered = np.array([_delivered(frame) for frame in recording.frames])[order]
@@ -208,7 +209,7 @@ def _delays(
             raise SystemExit(f"four_sensors: no {name} came")
         nearest = np.clip(np.searchsorted(times, stamps), 1, len(times) - 1)
         nearest -= stamps - times[nearest - 1] < times[nearest] - stamps
-        # Not among the frames: predicted, or the calibration has moved a clock.
+        # outputs without a frame are predicted, or the calibration has moved a clock
         known = np.abs(times[nearest] - stamps) < 20_000
         row: dict[str, float] = {"count": len(stamps), "matched": int(known.sum())}
         for since, values in (("capture", arrived - stamps), ("delivery", (arrived - delivered[nearest])[known])):

@@ -1,12 +1,12 @@
 """Is the uncertainty of the extended filter true? Normalised errors over many simulated people.
 
-Each run draws a body, a motion, a noise level and dropouts, and filters what is measured at default settings; the
-filter knows neither body nor noise. Every error is divided by what the filter states of it. Where the filter is
-honest, the normalised error squared e^2 / P of one coordinate follows chi-square(1), and that of all observed joint
-angles together (all but upper_body.UNOBSERVED, with their marginal covariance) chi-square(22), or chi-square(28) with
-the six coordinates of the base; 95 % of the time steps lie inside the 95 % band (Bar-Shalom, Li and Kirubarajan 2001,
-chapter 5.4.2). "in band" is the two-sided band, "below" the one-sided upper bound, both in percent; "mean" the mean
-divided by its dimension: 1 is honest, more is too sure, less too modest.
+Each run draws a body, a motion, a noise level and dropouts, and filters the measurements at default settings; the
+filter knows neither body nor noise. Every error is divided by its stated standard deviation. If the filter is honest,
+the normalised error squared e^2 / P of one coordinate follows chi-square(1). For all observed joint angles together
+(all but upper_body.UNOBSERVED, with their marginal covariance) it follows chi-square(22), with the six coordinates of
+the base chi-square(28); 95 % of the time steps lie inside the 95 % band (Bar-Shalom, Li and Kirubarajan 2001, chapter
+5.4.2). "in band" is the two-sided band, "below" the one-sided upper bound, both in percent; "mean" is the mean divided
+by its dimension: 1 is honest, more is overconfident, less is conservative.
 """
 
 from __future__ import annotations
@@ -41,26 +41,26 @@ from body_tracking.simulation.random_people import (
 NAMES = MODEL.coordinate_names
 OBSERVED = np.array([number for number, name in enumerate(NAMES) if name not in UNOBSERVED])
 TOGETHER = {"joint": OBSERVED[OBSERVED >= 6], "whole": OBSERVED}
-"""Which coordinates are taken together: the observed joint angles (the bar is theirs), and these with the base."""
+"""Groups of coordinates: the observed joint angles (the bar applies to them), and these with the base."""
 BAND, BAR = 0.95, 90.0
-"""The band, and the percentage of the time steps that must lie inside it."""
+"""The band, and the least percentage of the time steps inside it."""
 NOISE = 0.005, 0.040
-"""Metres: standard deviation per axis, log-uniform between."""
+"""Bounds of the log-uniform standard deviation per axis, metres."""
 DROPOUTS = 3
-"""At most so many in a run."""
+"""Largest number of dropouts in a run."""
 STILL, AFTER = 0.1, 1.0
-"""m/s: a person of whom no point is faster is still. Seconds for which a dropout is looked after."""
+"""m/s: a person is still if no point is faster. Seconds after a dropout that are evaluated separately."""
 
 
 def new_filter(parameters: Mapping[str, float]) -> ExtendedKalmanFilter:
-    """The filter under test; the only place that knows how to make it."""
-    # its people take poses at random over their ranges of motion: no posture is known of them
+    """The filter under test; the only place that constructs it."""
+    # the people take random poses over their ranges of motion: no posture prior
     return ExtendedKalmanFilter(EkfParameters(**({"posture": False} | parameters)))
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What all runs share: length of a run in seconds, parameters of the filter."""
+    """Settings of all runs: length of a run in seconds, parameters of the filter."""
 
     seconds: float
     parameters: Mapping[str, float]
@@ -68,17 +68,17 @@ class Settings:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One run: n estimates.
+    """One run with n estimates.
 
     Attributes:
-        noise: metres.
+        noise: standard deviation per axis, metres.
         times: (n,) seconds.
-        still: (n,) nothing moves faster than STILL.
+        still: (n,) whether no point is faster than STILL.
         lost: (n,) 2 while a modelled joint is not measured, 1 for AFTER seconds later, else 0.
-        error, stddev: (n, 32) tangent.
+        error, stddev: (n, 32) in the tangent space.
         position, velocity: (n, 32) normalised errors squared.
-        joint, whole: (n,) of the coordinates in TOGETHER; NaN where the covariance allows none.
-        without: frames of which there was no estimate.
+        joint, whole: (n,) the same for the groups in TOGETHER; NaN for a covariance that is not positive definite.
+        without: number of frames without an estimate.
     """
 
     noise: float
@@ -95,12 +95,12 @@ class Run:
 
 
 def simulate(settings: Settings, number: int) -> Run:
-    """One run from its number."""
+    """One run; its number seeds all draws."""
     rng, (low, high) = np.random.default_rng([0, number]), NOISE
     noise = low * (high / low) ** rng.random()
     person = RandomPerson.draw(rng)
     truth = truth_of(person, RandomMotion(rng, settings.seconds), capture_times(settings.seconds, rng))
-    rng.random(N_JOINTS)  # a draw of former versions: people of the same number stay the same
+    rng.random(N_JOINTS)  # unused draw of former versions: a number still gives the same person
     count = int(rng.integers(0, DROPOUTS + 1))
     dropouts = draw_dropouts(rng, count, (0.5, settings.seconds), longest=1.5, everything=0.1)
     gaps: tuple[tuple[float, float], ...] = ()
@@ -150,7 +150,7 @@ def simulate(settings: Settings, number: int) -> Run:
 def all_runs(
     work: Callable[[Any, int], Any], settings: Any, numbers: Sequence[int], processes: int
 ) -> tuple[list[Any], dict[int, str]]:
-    """The results of the runs in their order, and what went wrong in the others."""
+    """The results of the runs in their order, and the tracebacks of failed runs by number."""
     found = common.mapped(functools.partial(common.attempt, functools.partial(work, settings)), numbers, processes)
     broken = {number: problem for number, (_, problem) in zip(numbers, found, strict=True) if problem}
     for number, problem in itertools.islice(broken.items(), 3):
@@ -159,7 +159,7 @@ def all_runs(
 
 
 def shares(normalised: FloatArray, dimension: int, name: str = "") -> dict[str, float]:
-    """Of (n,) normalised errors squared: percentage in the two-sided band and below the upper bound, and the mean."""
+    """Percentages of (n,) normalised errors squared in the two-sided band and below the upper bound, and the mean."""
     low, high = chi2.ppf([0.5 - BAND / 2, 0.5 + BAND / 2], dimension)
     inside, below = (normalised >= low) & (normalised <= high), normalised <= chi2.ppf(BAND, dimension)
     mean = np.nanmean(normalised) / dimension if len(normalised) else np.nan
@@ -168,7 +168,7 @@ def shares(normalised: FloatArray, dimension: int, name: str = "") -> dict[str, 
 
 
 def splits(runs: list[Run]) -> dict[str, list[NDArray[np.bool_]]]:
-    """For each part of the time steps a mask per run."""
+    """For each part of the time steps, one mask per run."""
     low, high = np.quantile([run.noise for run in runs], [1 / 3, 2 / 3])
     parts: dict[str, Callable[[Run], NDArray[np.bool_]]] = {
         "all": lambda run: np.isfinite(run.times),
@@ -186,13 +186,13 @@ def splits(runs: list[Run]) -> dict[str, list[NDArray[np.bool_]]]:
 
 
 def pooled(runs: list[Run], masks: list[NDArray[np.bool_]], what: str) -> FloatArray:
-    """The time steps of all runs that the masks choose, one after the other."""
+    """The time steps of all runs that the masks select, concatenated."""
     result: FloatArray = np.concatenate([getattr(run, what)[mask] for run, mask in zip(runs, masks, strict=True)])
     return result
 
 
 def summarise(runs: list[Run]) -> dict[str, Any]:
-    """All figures; errors and stated deviations of coordinates are RMS, in mm and degrees."""
+    """All figures; errors and stated standard deviations of coordinates are RMS, in mm and degrees."""
     parts = splits(runs)
     position, velocity, error, stddev = (
         pooled(runs, parts["all"], what) for what in ("position", "velocity", "error", "stddev")
@@ -236,7 +236,7 @@ def main() -> int:
     common.add_set(parser)
     args = parser.parse_args()
     settings = Settings(args.seconds, dict(args.set))
-    new_filter(settings.parameters)  # a wrong parameter ends the benchmark here
+    new_filter(settings.parameters)  # an unknown parameter ends the benchmark here
     runs, broken = all_runs(simulate, settings, range(args.runs), args.jobs)
     if not runs:
         raise SystemExit("no run came to its end")

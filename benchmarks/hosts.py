@@ -1,9 +1,9 @@
-"""Hosts that are none: network namespaces with a bad link between them, and a clock of another computer.
+"""Simulated hosts: network namespaces with a bad link between them, and the clock of another computer.
 
-Knows only the standard library, so that its processes start at once. As a command:
+Uses only the standard library, so that its processes start quickly. As a command:
 
-    hosts.py relay LOSS JITTER PORT...   pass datagrams on, both ways; reads ``FROM TO`` (wall times of a cut) on stdin
-    hosts.py shift SECONDS COMMAND...    run a command whose monotonic clock is so far ahead
+    hosts.py relay LOSS JITTER PORT...   forward datagrams both ways; reads ``FROM TO`` (wall times of a cut) from stdin
+    hosts.py shift SECONDS COMMAND...    run a command with its monotonic clock this much ahead
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from pathlib import Path
 from typing import Any
 
 OUTSIDE, RELAY_OUT, RELAY_IN, INSIDE = "10.87.1.2", "10.87.1.1", "10.87.2.1", "10.87.2.2"
-"""Addresses of the far host, of the relay on either side, and of this host."""
+"""Addresses of the far host, of the relay on both sides, and of this host."""
 
 _CLONE_NEWTIME = 0x80
 
 
 def not_permitted() -> str:
-    """Why there can be no namespaces here; empty where there can."""
+    """Why namespaces are not possible here; empty if they are."""
     try:
         probe = ["unshare", *_kinds(), sys.executable, __file__, "shift", "1", "ip", "link"]
         tried = subprocess.run(probe, capture_output=True, text=True, timeout=60, check=False)
@@ -44,21 +44,21 @@ def _kinds() -> list[str]:
 
 
 def in_own_network(command: Sequence[str]) -> list[str]:
-    """The command in a network namespace of its own."""
+    """The command in its own network namespace."""
     return ["unshare", *_kinds(), *command]
 
 
 def command(*words: object) -> list[str]:
-    """This file as a command."""
+    """Command line of this file."""
     return [sys.executable, __file__, *(str(word) for word in words)]
 
 
 @contextlib.contextmanager
 def hosts() -> Iterator[tuple[list[str], list[str]]]:
-    """Two more hosts, the second one between the first and this one; for a process in a namespace of its own.
+    """Two more hosts, the second between the first and this one; for a process in its own namespace.
 
     Yields:
-        What to put before a command to run it on the far host, and on the one between. Both end with this.
+        Prefixes of a command that run it on the far host, and on the host between. Both hosts end with this context.
     """
     _ip([], "link set lo up")
     holders = [subprocess.Popen(["unshare", "--net", "sleep", "3600"]) for _ in range(2)]
@@ -92,11 +92,11 @@ def _ip(prefix: Sequence[str], words: str) -> None:
 
 
 def relay(loss: float, jitter: float, ports: Sequence[int]) -> None:
-    """Pass datagrams on between the far host and the inner one, until stdin ends.
+    """Forward datagrams between the far host and the inner one, until stdin ends.
 
     Args:
-        loss: probability that a packet is lost.
-        jitter: seconds by which a packet is held up at most; the times are uniform.
+        loss: probability of losing a packet.
+        jitter: largest delay of a packet, seconds; delays are uniform.
         ports: to which the far host sends.
     """
     numbers = random.Random(1)
@@ -142,13 +142,13 @@ def relay(loss: float, jitter: float, ports: Sequence[int]) -> None:
 
 
 def shift(seconds: float, words: Sequence[str]) -> int:
-    """Run a command whose monotonic clock is shifted; its exit code."""
+    """Run a command with a shifted monotonic clock; returns its exit code."""
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.unshare(_CLONE_NEWTIME):
         raise SystemExit(f"no time namespace: {os.strerror(ctypes.get_errno())}")
     whole, rest = divmod(round(seconds * 1e9), 1_000_000_000)
     Path("/proc/self/timens_offsets").write_text(f"monotonic {whole} {rest}\n")
-    process = subprocess.Popen(words)  # only children are in the new namespace
+    process = subprocess.Popen(words)  # only child processes are in the new time namespace
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda got, _: process.send_signal(got))
     return process.wait()

@@ -1,16 +1,16 @@
-"""One Kinect v2 and two inertial sensors on the wrists against that Kinect alone, on simulated people.
+"""One Kinect v2 with two inertial sensors on the wrists, beside that Kinect alone, on simulated people.
 
-The setting of Jatesiktat et al. (2018): a person before one Kinect that errs like a real one, with an inertial sensor
-on each forearm that errs like a consumer's (``simulation.imus``). The filter ``ekf`` at its defaults gets the same
-frames alone, and with the orientations of the forearms, of which it gets what an alignment would leave: the mounting to
-``misalignment_stddev`` and the heading to ``heading_stddev``, drawn for each sensor. A third row is a Kinect that is
-wrong by nothing but where it takes the joints' centres to be, with the same inertial sensors.
+The setting of Jatesiktat et al. (2018): a person in front of one Kinect with realistic errors, with an inertial sensor
+on each forearm with the errors of a consumer's chip (``inertial.simulated``). The filter ``ekf`` at its defaults gets
+the same frames without and with the orientations of the forearms. The orientations have the errors left by an
+alignment: mounting by ``misalignment_stddev`` and heading by ``heading_stddev``, drawn for each sensor. The third row
+is a Kinect whose only errors are the offsets of its joint centres, with the same inertial sensors.
 
 Errors of the joints of both arms in world: mean 3D error (mm), also where the joint is hidden from the Kinect by the
 body; without each joint's constant offset in the body's own frames ("fixed"); RMS error of the forearms' turn about
-their own axes in world and of the model's pronation (degrees), and share of the frames in which the latter lies within
-1.96 stated standard deviations. Rules and defaults for orientations were chosen on the people of seeds 1000, 4000 and
-4001; the default takes others.
+their own axes in world and of the model's pronation (degrees), and share of the frames with the pronation's error
+within 1.96 stated standard deviations. Rules and defaults for orientations were chosen with seeds 1000, 4000 and 4001;
+the default seeds are others.
 """
 
 from __future__ import annotations
@@ -48,22 +48,22 @@ _FIRST_SEED = 4200
 _HIDDEN_FROM = 0.35
 _SETTLED_NS = NANOSECONDS
 LOWER, LOWER_HIDDEN, TURN = 15.0, 40.0, 10.0
-"""Percent, percent and degrees: the bars."""
+"""Bars: percent, percent and degrees."""
 _Z = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Figures:
-    """Of one way to measure in one run.
+    """Errors of one measuring setup in one run.
 
     Attributes:
-        distance: (n, 6) metres, 3D errors of the joints of ``ARMS``.
-        fixed: (n, 6) metres, the same without the constant offset.
-        turn: (n, 2) radians, by how much the forearms are turned about their own axes, off the truth.
-        hidden: (n, 6) whether they are hidden from the Kinect.
-        rotation: (n, 2) radians, errors of the model's pronation, against the upper arm.
-        stddev: (n, 2) radians, as stated.
-        seconds: of computing, per frame of the Kinect.
+        distance: (n, 6) 3D errors of the joints of ``ARMS``, metres.
+        fixed: (n, 6) the same without the constant offset, metres.
+        turn: (n, 2) errors of the forearms' turn about their own axes, radians.
+        hidden: (n, 6) whether the joints are hidden from the Kinect.
+        rotation: (n, 2) errors of the model's pronation (forearm against upper arm), radians.
+        stddev: (n, 2) stated standard deviations of the pronation, radians.
+        seconds: processor time per frame of the Kinect.
     """
 
     distance: FloatArray
@@ -77,14 +77,14 @@ class Figures:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """What is simulated: a motion, a seed, and the parameters of the filter."""
+    """A motion, a seed, and the parameters of the filter."""
 
     motion: str
     seed: int
     parameters: EkfParameters
 
     def recording(self, *, offsets_alone: bool = False) -> SimulatedRecording:
-        """Simulate it, or the same with a Kinect that is wrong by nothing but where it takes the joints to be."""
+        """Simulate the run; with ``offsets_alone``, the offsets of the joint centres are the Kinect's only errors."""
         errors = KinectErrors().offsets_alone() if offsets_alone else KinectErrors()
         imus = tuple(
             SimulatedImu(f"imu_{segment}", segment, usual_mounting(segment), oriented=True) for segment in SEGMENTS
@@ -95,12 +95,12 @@ class Run:
 def aligned(
     imu: SimulatedImu, samples: ImuSamples, parameters: EkfParameters, rng: np.random.Generator
 ) -> list[SegmentOrientation]:
-    """What is left of a sensor's orientations after an alignment that is as good as the filter takes it to be."""
+    """Orientations of a sensor after an alignment as accurate as the filter assumes."""
     assert samples.orientation is not None
     mounting = so3.quat_multiply(
         so3.exp(parameters.misalignment_stddev * rng.normal(size=3)), samples.truth.mounting_xyzw
     )
-    # the heading of the sensor's own level frame, known once from the truth, and wrong by what is drawn
+    # heading of the sensor's own level frame from the truth at the first sample, plus a drawn error
     off = so3.quat_multiply(samples.truth.quat_xyzw[0], so3.quat_inverse(samples.orientation[0]))
     heading = 2.0 * np.arctan2(off[2], off[3]) + parameters.heading_stddev * rng.normal()
     to_world = so3.exp(heading * _Z)
@@ -132,7 +132,7 @@ def measure(run: Run) -> dict[str, Figures]:
 
 
 def placed(recording: SimulatedRecording) -> list[Skeleton]:
-    """What the Kinect says, in world."""
+    """Skeletons of the Kinect, in world."""
     pose = recording.sensors[0].pose
     alignment = SensorAlignment([pose.sensor])
     alignment.set_pose(pose)
@@ -141,7 +141,7 @@ def placed(recording: SimulatedRecording) -> list[Skeleton]:
 
 
 def worn(recording: SimulatedRecording, run: Run) -> list[SegmentOrientation]:
-    """What the inertial sensors say, aligned."""
+    """Orientations of the inertial sensors, aligned."""
     rng = np.random.default_rng([run.seed, 9])
     return [each for imu, samples in recording.imus for each in aligned(imu, samples, run.parameters, rng)]
 
@@ -152,7 +152,7 @@ def filtered(
     orientations: list[SegmentOrientation],
     parameters: EkfParameters,
 ) -> Figures:
-    """What the filter makes of frames and orientations in the order of their capture, against the truth."""
+    """Filter frames and orientations in the order of their capture, and compare the result with the truth."""
     truth, pose = recording.truths[0], recording.sensors[0].pose
     estimator = ExtendedKalmanFilter(parameters)
     found: list[tuple[int, FloatArray, FloatArray, FloatArray]] = []
@@ -188,7 +188,7 @@ def filtered(
 
 
 def _turn(q: FloatArray, true: FloatArray, lengths: FloatArray) -> FloatArray:
-    """(n, 2) radians: the twist about its own axis between each forearm as it is and as it was found."""
+    """(n, 2) twist about its own axis between each estimated forearm and the true one, radians."""
     numbers = [MODEL.segment_names.index(segment) for segment in SEGMENTS]
     found, right = (MODEL.forward(each, lengths).rotations[:, numbers] for each in (q, true))
     quats = so3.matrix_to_quat(found.swapaxes(-1, -2) @ right)
@@ -197,7 +197,7 @@ def _turn(q: FloatArray, true: FloatArray, lengths: FloatArray) -> FloatArray:
 
 
 def summary(figures: list[Figures]) -> dict[str, float]:
-    """Over several runs: mean errors in mm, RMS of the forearms' rotation in degrees, its coverage."""
+    """Figures over several runs: mean errors in mm, RMS of the forearms' rotation in degrees, its coverage."""
     distance, fixed, hidden, turn, rotation, stddev = (
         np.concatenate([getattr(each, name).ravel() for each in figures])
         for name in ("distance", "fixed", "hidden", "turn", "rotation", "stddev")

@@ -1,21 +1,21 @@
-"""What becomes of the joint angles when an inertial sensor fails: in the whole graph, by what it publishes.
+"""Joint angles when an inertial sensor fails: in the whole graph, by its published messages.
 
-A simulated person before one Kinect v2 wears five inertial sensors (chest, upper arms, forearms; raw data and
-magnetic fields of a consumer's chip on a strap, ``simulation.imus``, each with a clock of its own). The recording goes
-as messages through calibration, fusion, ``imu_skeleton``, the filter ``ekf`` and its estimates, as ``body_tracking
-replay`` runs them, all at their defaults. From second 30 on
+A simulated person in front of one Kinect v2 wears five inertial sensors (chest, upper arms, forearms; raw data and
+magnetic fields of a consumer's chip on a strap, ``inertial.simulated``, each with its own clock). The recording passes
+as messages through calibration, fusion, ``imu_skeleton``, the filter ``ekf`` and its estimates, as in ``body_tracking
+replay``, all at their defaults. From second 30 on
 
-  disturbed   a magnet lies beside the person for 30 s: where the right hand hangs, it adds as much as the earth's field
-  off         the right forearm's sensor is switched off for 10 s, and comes back with another heading and biases
+  disturbed   a magnet lies beside the person for 30 s: at the hanging right hand it adds as much as the earth's field
+  off         the right forearm's sensor is switched off for 10 s, and returns with another heading and other biases
   slipped     the right forearm's sensor slips about the arm by 20 degrees, and stays so
-  bent        the same across the arm
+  bent        it slips across the arm by 20 degrees, and stays so
   exchanged   the sensors of both forearms are on each other's arm (from the beginning)
 
-Of each: what diagnostics name, and when for the first time; RMS errors of the right arm's angles before, from the fault
-on, and in the last 20 s; and the share of all ten angles (of both sides the upper arm against the chest about three
-axes, elbow, pronation) in all frames from the fault on that are right by 10 degrees or by 1.96 of their stated standard
-deviations. The bars: what went wrong is named, and not before; and as many angles are right as in the same recording
-without a fault, to within 2 %, or 95 %.
+For each fault: the time of its first line in the diagnostics; RMS errors of the right arm's angles before the fault,
+from its start on, and in the last 20 s; and the share of right angles among all ten (per side the upper arm against the
+chest about three axes, elbow, pronation) in all frames from its start on. An angle is right if its error is
+below 10 degrees or below 1.96 stated standard deviations. The bars: diagnostics name the fault, and not before it; and
+the share of right angles is at least 95 %, or at most 2 % below that of the same recording without a fault.
 """
 
 from __future__ import annotations
@@ -54,22 +54,22 @@ NAMED = {
     "bent": f"{FAULTY}: its sensor has slipped",
     "exchanged": f"{FAULTY}: its sensor is on forearm_left",
 }
-"""What diagnostics say of each fault."""
+"""Line of the diagnostics for each fault."""
 MOTIONS = ("reaching", "arm_raises")
 BEGIN, DISTURBED, OFF, SLIP = 30.0, 30.0, 10.0, float(np.radians(20.0))
 SETTLED, LAST, LOOKED = 8.0, 20.0, 0.2
-"""Seconds from the beginning that are not judged, at the end that have figures of their own, and from look to look at
-diagnostics."""
+"""Seconds at the beginning that are not evaluated, seconds at the end with their own figures, and seconds between two
+readings of the diagnostics."""
 ENOUGH, RIGHT, LESS = float(np.radians(10.0)), 0.95, 0.02
 _FIRST_SEED = 6500
 _RIGHT_ARM = [place for place, name in enumerate(ANGLES) if name.endswith("right")]
 _MOMENT = 30.0
-"""A m2 of the magnet: 48 uT half a metre away on its axis."""
+"""Magnetic moment of the magnet, A m2: 48 uT at 0.5 m on its axis."""
 
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """Who does what, and what goes wrong."""
+    """A motion, a person by seed, and a fault."""
 
     motion: str
     seed: int
@@ -113,38 +113,38 @@ class Run:
             return Surroundings()
         left = np.array([-np.sin(layout.yaw), np.cos(layout.yaw), 0.0])
         place = layout.position - 0.6 * left + [0.0, 0.0, 0.8]
-        since = BEGIN + 0.5  # it comes within half a second before
+        since = BEGIN + 0.5  # the magnet approaches over the half second before
         return Surroundings(iron=(Iron(place, _MOMENT * left, 0.1, since, BEGIN + DISTURBED),))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Figures(Angles):
-    """Of one run.
+    """Angles of one run, with the diagnostics.
 
     Attributes:
-        named: when each line of the diagnostics was there first, seconds.
-        oriented: seconds of the last orientation of the faulty sensor's segment.
+        named: time of each line's first appearance in the diagnostics, seconds.
+        oriented: time of the last orientation of the faulty sensor's segment, seconds.
     """
 
     named: dict[str, float]
     oriented: float
 
     def right(self, since: float) -> FloatArray:
-        """(10,) share of the frames in which each angle is right by what is enough, or by what is stated."""
+        """(10,) share of the frames from ``since`` (s) with an error below ``ENOUGH`` or 1.96 stated deviations."""
         error, stddev = (np.abs(each[self.times >= since]) for each in (self.error, self.stddev))
         return np.asarray(((error < ENOUGH) | (error < common.NORMAL * stddev)).mean(axis=0), dtype=float)
 
     def arm(self, since: float, until: float = np.inf) -> float:
-        """Degrees RMS of the right arm's angles."""
+        """RMS error of the right arm's angles, degrees."""
         return common.rms_deg(self.error[(self.times >= since) & (self.times < until)][:, _RIGHT_ARM])
 
     def first(self, words: str) -> float:
-        """When a line with these words was there first; infinite if never."""
+        """Time of the first line with these words, seconds; infinite without one."""
         return min((when for line, when in self.named.items() if words in line), default=np.inf)
 
 
 def measure(run: Run) -> Figures:
-    """Simulate a run, and send it through the graph."""
+    """Simulate a run, and pass it through the graph."""
     recording = run.recording()
     configurations: list[FloatArray] = []
     states: list[tuple[int, FloatArray, FloatArray]] = []  # stamp, configuration and covariance of each estimate
@@ -192,7 +192,7 @@ def measure(run: Run) -> Figures:
 
 
 def judge(fault: str, results: list[Figures], usual: list[Figures]) -> tuple[dict[str, Any], bool]:
-    """Figures of some runs with a fault, beside the same without: degrees, percent; whether the bars are met."""
+    """Figures of runs with a fault, beside those without: degrees, percent; and whether the bars are met."""
     since = SETTLED if fault == "exchanged" else BEGIN
     until = max(float(each.times[-1]) for each in results)
     right, as_usual = (float(np.mean([each.right(since) for each in some])) for some in (results, usual))

@@ -1,13 +1,13 @@
 """Ten inertial sensors at 100 Hz beside two Kinects, live: delay from capture to joint angles, and whether it grows.
 
-A simulated person (T-pose, then ``reaching``) before two Kinects and with ten sensors that send their orientation. This
-process sends every message when it would have come, to the graph's own calibration, fusion, ``imu_skeleton``,
-``skeleton_filter`` (ekf, which takes all ten) and ``joint_angles``, each a process. Beside them a chain of bare relays
-(``latency.py``) has in the same run the delay of as many rclpy processes that compute nothing: the floor.
+A simulated person (T-pose, then ``reaching``) in front of two Kinects wears ten sensors that send their orientation.
+This process publishes every message in real time to the graph's own calibration, fusion, ``imu_skeleton``,
+``skeleton_filter`` (ekf, which takes all ten) and ``joint_angles``, each in its own process. In the same run a chain of
+bare relays (``latency.py``) gives the delay of as many rclpy processes without computation: the floor.
 
-Judged are the median delay beyond the floor's, which depends on the machine and on who else uses it, and the backlog:
-the median delay of the last third of the run against the first's, and how many orientations came of those due. A busy
-machine slows graph and floor alike, not by as much: the ratio is what two runs have in common.
+The bars apply to the median delay beyond the floor, which depends on the machine and its load, and to the backlog: the
+median delay of the last third of the run against the first third's, and the share of the due orientations received. A
+busy machine slows graph and floor alike, but not by the same amount; compare two runs by the ratio.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ SEGMENTS = ("pelvis", "lower_trunk", "upper_trunk", "head") + tuple(
     f"{name}_{side}" for name in ("upper_arm", "forearm", "hand") for side in ("left", "right")
 )
 COUNTED = SEGMENTS[0], SEGMENTS[-1]
-"""Whose orientations are counted: to listen to all of them would cost as much as a node of the graph."""
+"""Segments whose orientations are counted: to subscribe to all of them would cost as much as a node of the graph."""
 BEYOND_MS, GROWTH, COMPLETE = 10.0, 1.5, 0.9
-"""Milliseconds beyond the floor; the last third's median delay against the first's; share of orientations."""
+"""Milliseconds beyond the floor; median delay of the last third over the first's; share of orientations received."""
 LATE_MS = 20.0
-"""Milliseconds by which the sending of the sensors' messages may be late."""
+"""Largest delay of sending the sensors' messages, milliseconds."""
 _SETTLED_S = 8.0
 _ORIENTATIONS_HZ = 100.0 / 3.0
-"""Of readings 10 ms apart every third one: the default of 30 Hz lets them come a little sooner."""
+"""Every third of readings 10 ms apart: the default of 30 Hz accepts them a little early."""
 
 
 def recorded(seconds: float) -> SimulatedRecording:
@@ -58,7 +58,7 @@ def recorded(seconds: float) -> SimulatedRecording:
 
 
 def events(recording: SimulatedRecording) -> Iterator[live.Event]:
-    """What all sensors and the first relay are to send; all clocks are this process's."""
+    """All messages for the sensors' topics and the first relay; all clocks are this process's."""
     reference = recording.sensors[0].pose.sensor
     clocks = {sensor.pose.sensor: sensor.clock for sensor in recording.sensors}
     for frame in recording.frames:
@@ -82,7 +82,7 @@ def _topic(segment: str) -> str:
 
 
 def measure(seconds: float) -> dict[str, Any]:
-    """Run both chains, and compare."""
+    """Run both chains, and compare their delays."""
     common.progress("simulating ...")
     recording = recorded(seconds + _SETTLED_S)
     poses = {sensor.pose.sensor: sensor.pose for sensor in recording.sensors}

@@ -1,15 +1,16 @@
-"""Seven inertial sensors and no camera, for ten minutes: the angles of both arms, and what is stated of them.
+"""Seven inertial sensors and no camera, for ten minutes: the angles of both arms, and their stated deviations.
 
-Chest, pelvis, head, both upper arms and both forearms carry a sensor that errs like a consumer's (``simulation.imus``).
-A person takes a T-pose as people do, which aligns the sensors, and does one thing of the repertoire over and over.
-``imu_skeleton``'s tracker makes orientations of the readings in the order of their receipt, and the filter ``ekf`` at
-its defaults angles of these.
+Chest, pelvis, head, both upper arms and both forearms carry a sensor with the errors of a consumer's chip
+(``inertial.simulated``). A person takes a realistic T-pose, which aligns the sensors, and repeats one motion of the
+repertoire. The tracker of ``imu_skeleton`` computes orientations from the readings in the order of their receipt, and
+the filter ``ekf`` at its defaults computes angles from them.
 
-Eight angles, as many as OpenSenseRT judges (Slade et al., IEEE TBME 69 (2022) 664: 5.6 degrees): of both sides the
+Eight angles, as many as OpenSenseRT is evaluated by (Slade et al., IEEE TBME 69 (2022) 664: 5.6 degrees): per side the
 rotation of the upper arm against the chest about the chest's three axes (Euler angles would divide by the sine of an
-angle that the T-pose makes zero), and the elbow's flexion; pronation beside them. RMS errors in degrees from the end of
-the first pose on. With magnetometers in a clean field the RMSE of the eight has a bar, without them the share of the
-frames within 1.96 stated standard deviations. The library was tuned on seeds below 6000; the default takes others.
+angle that is zero in the T-pose), and elbow flexion; also pronation. RMS errors in degrees from the end of the first
+pose on. With magnetometers in a clean field the bar applies to the RMSE of the eight angles, without magnetometers to
+the share of frames within 1.96 stated standard deviations. The library was tuned on seeds below 6000; the default seeds
+are others.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ _ELBOWS, _PRONATIONS = (
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """Who does what, with which sensors."""
+    """A motion, a person by seed, the duration, and whether the sensors have magnetometers."""
 
     motion: str
     seed: int
@@ -86,12 +87,12 @@ class Run:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Angles:
-    """What became of the angles in one run.
+    """Errors of the angles in one run.
 
     Attributes:
         times: (n,) seconds from the beginning.
-        error: (n, 10) radians, of ``ANGLES``.
-        stddev: (n, 10) radians, stated.
+        error: (n, 10) of ``ANGLES``, radians.
+        stddev: (n, 10) stated, radians.
     """
 
     times: FloatArray
@@ -101,18 +102,18 @@ class Angles:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Figures(Angles):
-    """Of one run, with the seconds of computing."""
+    """Angles of one run, with the processor time in seconds."""
 
     seconds: float
 
 
 def readings(imu: SimulatedImu, said: ImuSamples) -> list[tuple[int, str, int]]:
-    """Receipt, segment, number of the sample."""
+    """(receipt in ns, segment, number of the sample) of each reading."""
     return [(int(received), imu.segment, k) for k, received in enumerate(said.received_ns.tolist())]
 
 
 def sample(imu: SimulatedImu, said: ImuSamples, k: int) -> ImuSample:
-    """One reading as the node would take it."""
+    """One reading as the node takes it."""
     return ImuSample(
         int(said.stamps_ns[k]),
         f"{imu.name}_link",
@@ -125,11 +126,11 @@ def sample(imu: SimulatedImu, said: ImuSamples, k: int) -> ImuSample:
 
 
 def measure(run: Run) -> Figures:
-    """Simulate a run, and make angles of its readings."""
+    """Simulate a run, and estimate angles from its readings."""
     recording = run.recording()
     worn = {imu.segment: (imu, said) for imu, said in recording.imus}
     events = sorted(each for imu, said in recording.imus for each in readings(imu, said))
-    # the skeleton of the node is not looked at
+    # the node's skeleton is not used
     tracker = InertialTracker(SEGMENTS, TrackingParameters(camera=False, rate=1.0))
     estimator = ExtendedKalmanFilter()
     times, configurations, stddevs = [], [], []
@@ -163,7 +164,7 @@ def measure(run: Run) -> Figures:
 
 
 def angle_variances(q: FloatArray, covariance: FloatArray) -> FloatArray:
-    """(10,) rad2 of ``ANGLES``, by the covariance of the tangent and more."""
+    """(10,) variances of ``ANGLES``, rad2, from a covariance whose first block is that of the tangent space."""
     lines = MODEL.linearise(q, MODEL.default_lengths())
     turning = lines.rotation_jacobian
     to_chest = lines.posture.rotations[_TRUNK].T
@@ -174,13 +175,13 @@ def angle_variances(q: FloatArray, covariance: FloatArray) -> FloatArray:
     rows += list(np.eye(MODEL.nv)[_PRONATIONS])
     jacobian = np.array(rows)
     spread = covariance[: MODEL.nv, : MODEL.nv].copy()
-    spread[:3] = spread[:, :3] = 0.0  # where the base is, nobody knows, and no angle asks
+    spread[:3] = spread[:, :3] = 0.0  # the base's position is unknown and changes no angle
     result: FloatArray = np.einsum("ij,jk,ik->i", jacobian, spread, jacobian)
     return result
 
 
 def true_configurations(recording: SimulatedRecording, times: FloatArray) -> FloatArray:
-    """(n, 35) between the instants at which the truth is known."""
+    """(n, 35) true configurations, interpolated to these times in seconds."""
     truth = recording.truths[0]
     stamps = (truth.stamps_ns - START_NS) / NANOSECONDS
     after = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
@@ -189,7 +190,7 @@ def true_configurations(recording: SimulatedRecording, times: FloatArray) -> Flo
 
 
 def angle_errors(q: FloatArray, true: FloatArray) -> FloatArray:
-    """(n, 10) radians, of ``ANGLES``."""
+    """(n, 10) errors of ``ANGLES``, radians."""
     found, right = (MODEL.forward(each, MODEL.default_lengths()).rotations for each in (q, true))
     scalars = MODEL.difference(true, q)
     columns = []
@@ -202,7 +203,7 @@ def angle_errors(q: FloatArray, true: FloatArray) -> FloatArray:
 
 
 def pooled(figures: list[Figures], columns: slice | list[int]) -> dict[str, float]:
-    """Of some angles: RMS, of which constant and varying, and stated, degrees; percentage within 1.96 of the latter."""
+    """RMS of some angles, its constant and varying part, and RMS stated, degrees; percentage within 1.96 stated."""
     errors = [each.error[:, columns] for each in figures]
     means = [error.mean(axis=0, keepdims=True) for error in errors]
     stddev = np.concatenate([each.stddev[:, columns] for each in figures])
@@ -217,7 +218,7 @@ def pooled(figures: list[Figures], columns: slice | list[int]) -> dict[str, floa
 
 
 def summary(figures: list[Figures], seconds: float) -> dict[str, dict[str, float]]:
-    """Of the eight angles, each kind of angle, and the eight by the minute (or a tenth of what is shorter)."""
+    """Figures of the eight angles, of each kind of angle, and of the eight by the minute (or a tenth of less)."""
     kinds = ("shoulder_x", "shoulder_y", "shoulder_z", "elbow", "pronation")
     rows = {"eight angles": pooled(figures, slice(EIGHT))}
     rows |= {kind: pooled(figures, [k for k, name in enumerate(ANGLES) if name.startswith(kind)]) for kind in kinds}

@@ -1,18 +1,19 @@
 """Orientation from raw inertial data against Vicon: a pendulum of three links, 174 s (Szczesna et al. 2016).
 
-Each link carries an inertial sensor, from whose rate, acceleration and magnetic field ``OrientationEstimator`` makes
+Each link carries an inertial sensor. From its rate, acceleration and magnetic field, ``OrientationEstimator`` computes
 orientations, reading by reading. Fitted per link: one constant rotation from the sensor to the link, one from the earth
-to Vicon's frame. ``total``: RMS of the angle between ours and Vicon's orientation, degrees; ``inclination``: of that
-part whose axis is level; ``stated``: RMS of our own standard deviation; ``joint``: RMS error of the angle about the
+to Vicon's frame. ``total``: RMS of the angle between ours and Vicon's orientation, degrees; ``inclination``: of its
+part about level axes; ``stated``: RMS of our own standard deviation; ``joint``: RMS error of the angle about the
 hinge between two links.
 
-Vicon's clock wanders against that of the sensors, by the same on each link: its frames were laid evenly over the rows,
-also where the log of the sensors stood still for 0.02 to 0.18 s. So for each link a course of the offset is estimated
-from the two other links, from their own rates against those of their own Vicon. ``by 1 offset``: by one constant
-offset of up to 0.1 s that is fitted to the link itself. The bars are those of the former.
+Vicon's clock wanders against that of the sensors, by the same on each link: its frames were spread evenly over the
+rows, even where the log of the sensors paused for 0.02 to 0.18 s. So for each link the course of the offset is
+estimated from the two other links, from their rates against those of Vicon. ``by 1 offset``: by one constant offset of
+up to 0.1 s that is fitted to the link itself. The bars apply to the former.
 
-Left out: Vicon's frames within half a second of where its orientation is none (a quaternion that is not of unit
-length), stands still to the last digit for half a second, or turns by 3 degrees more or less than in the frames around.
+Left out: Vicon's frames within half a second of a frame with an invalid orientation (the quaternion has not unit
+length), a frame of a standstill to the last digit for half a second, or one that turns by 3 degrees more or less than
+the frames around it.
 """
 
 from __future__ import annotations
@@ -43,34 +44,34 @@ SETTLING_S = 1.0
 _AROUND_S = 0.5
 _JUMP = np.radians(3.0)
 _AMONG = 9
-"""Frames of whose turns the median is taken."""
+"""Number of frames in the running median of the turns."""
 _HELD_S = 0.5
 _OFFSET_S = 0.1
 _COARSE = 20
 _KNOT = 20
-"""Frames from one knot of the offset's course to the next."""
+"""Frames between two knots of the offset's course."""
 _BEND_S = 0.006
-"""Standard deviation of what the offset bends by from knot to knot."""
+"""Standard deviation of the offset's second difference over the knots, seconds."""
 _FAR_S = 0.1
-"""Of the offset itself."""
+"""Standard deviation of the offset itself, seconds."""
 _STRIDE_S = 0.02
 _ROUNDS = 15
 RANGE = np.radians(600.0)
-"""Of the gyroscopes: the third one's readings end there."""
+"""Range of the gyroscopes, rad/s: the third one's readings end there."""
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A link: what was estimated at ``stamps`` (n,), and Vicon's frames at ``times`` (m,), seconds.
+    """One link: our estimates at ``stamps`` (n,), and Vicon's frames at ``times`` (m,), seconds.
 
     Attributes:
-        ours: orientations, (n,).
+        ours: (n,) orientations.
         rates: (n, 3) rad/s in the sensor's frame.
-        variances: (n, 3) rad2.
+        variances: (n, 3) of the orientations, rad2.
         disturbed: share of readings in a disturbed magnetic field.
-        vicon: (m, 3, 3).
-        turns: (m - 1, 3) radians from frame to frame, in the link's frame.
-        kept: (m,) the frames that are not left out.
+        vicon: (m, 3, 3) orientations.
+        turns: (m - 1, 3) rotation vectors from frame to frame in the link's frame, radians.
+        kept: (m,) whether the frame is used.
     """
 
     stamps: FloatArray
@@ -86,9 +87,9 @@ class Recording:
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """Orientations of a link at Vicon's times, ours after the fit, as (n, 3, 3) matrices; the errors, (n, 3) radians.
+    """Orientations (n, 3, 3) of a link at Vicon's times, ours after the fit, and the errors (n, 3), radians.
 
-    ``world`` and ``mounting`` are what was fitted, (3, 3).
+    ``world`` and ``mounting`` (3, 3) are the fitted rotations.
     """
 
     times: FloatArray
@@ -100,18 +101,18 @@ class Fitted:
 
     @property
     def total(self) -> float:
-        """Degrees."""
+        """RMS of the total angle, degrees."""
         return rms_deg(np.linalg.norm(self.errors, axis=1))
 
     @property
     def inclination(self) -> float:
-        """Degrees."""
+        """RMS of the inclination, degrees."""
         up = self.world[:, 2]
         return rms_deg(np.linalg.norm(self.errors - np.outer(self.errors @ up, up), axis=1))
 
 
 def fit(ours: FloatArray, vicon: FloatArray, rounds: int) -> tuple[FloatArray, FloatArray]:
-    """World and mounting (3, 3) for which ``world @ ours @ mounting`` is nearest to Vicon's, by turns."""
+    """World and mounting (3, 3) that bring ``world @ ours @ mounting`` closest to Vicon, by alternating fits."""
     mounting = ours[0].T @ vicon[0]
     for _ in range(rounds):
         world = so3.nearest_rotation(np.einsum("nij,nkj->ik", vicon, ours @ mounting))
@@ -120,7 +121,7 @@ def fit(ours: FloatArray, vicon: FloatArray, rounds: int) -> tuple[FloatArray, F
 
 
 def sound(times: FloatArray, quats: FloatArray, turns: FloatArray) -> BoolArray:
-    """Which of Vicon's frames are none of those that are left out."""
+    """(m,) whether Vicon's frames are used (see above)."""
     wrong = ~(np.abs(np.linalg.norm(quats, axis=1) - 1.0) < 0.01)
     odd = np.linalg.norm(turns - median_filter(turns, (_AMONG, 1), mode="nearest"), axis=1) > _JUMP
     same = (quats[1:] == quats[:-1]).all(axis=1)
@@ -131,7 +132,7 @@ def sound(times: FloatArray, quats: FloatArray, turns: FloatArray) -> BoolArray:
 
 
 def record(path: Path) -> Recording:
-    """One link."""
+    """Read one link."""
     estimator = OrientationEstimator(errors=InertialErrors(gyro_range=RANGE))
     found, disturbed = [], []
     for reading in ImuCsvRecording(path):
@@ -157,7 +158,7 @@ def record(path: Path) -> Recording:
 
 
 def fitted(link: Recording, offsets: FloatArray | float, rounds: int, every: int = 1) -> Fitted:
-    """World and mounting for offsets of the clocks, one or one for each of Vicon's frames."""
+    """Fit world and mounting for clock offsets in s: one, or one for each of Vicon's frames."""
     at = link.times + offsets
     inside = link.kept & (link.times > link.stamps[0] + SETTLING_S) & (link.times < link.stamps[-1] - _OFFSET_S)
     inside &= (at > link.stamps[0]) & (at < link.stamps[-1])
@@ -171,7 +172,7 @@ def fitted(link: Recording, offsets: FloatArray | float, rounds: int, every: int
 
 
 def one_offset(link: Recording) -> Fitted:
-    """By one constant offset, of up to 0.1 s, that fits the link best."""
+    """Fit with the best constant offset of at most 0.1 s."""
 
     def apart(offset: float) -> float:
         return fitted(link, offset, 40, _COARSE).total
@@ -181,14 +182,14 @@ def one_offset(link: Recording) -> Fitted:
 
 
 def rate_at(link: Recording, times: FloatArray) -> FloatArray:
-    """(n, 3) rad/s in the sensor's frame."""
+    """(n, 3) rates in the sensor's frame, interpolated, rad/s."""
     return np.stack([np.interp(times, link.stamps, column) for column in link.rates.T], axis=1)
 
 
 def wandering(links: list[tuple[Recording, FloatArray]]) -> FloatArray:
-    """(m,) offsets of the clocks at Vicon's frames, by what links with their mountings (3, 3) turned.
+    """(m,) clock offsets at Vicon's frames, seconds, from the rates of links with their mountings (3, 3).
 
-    Piecewise linear over knots, which a Gauss-Newton fit with Cauchy weights finds for which the rates agree best.
+    Piecewise linear over knots; a Gauss-Newton fit with Cauchy weights minimises the difference of the rates.
     """
     times = links[0][0].times
     frames = np.arange(len(times) - 1) + 0.5
@@ -218,7 +219,7 @@ def wandering(links: list[tuple[Recording, FloatArray]]) -> FloatArray:
 
 
 def hinge(upper: Fitted, lower: Fitted) -> float:
-    """RMS error of the angle about the hinge, along the links' z, degrees."""
+    """RMS error of the angle about the hinge, which is the links' z axis, degrees."""
     _, first, second = np.intersect1d(upper.times, lower.times, return_indices=True)
     angles = []
     for above, below in ((upper.ours, lower.ours), (upper.vicon, lower.vicon)):
@@ -228,7 +229,7 @@ def hinge(upper: Fitted, lower: Fitted) -> float:
 
 
 def measure(recordings: list[Recording]) -> tuple[list[dict[str, Any]], list[Fitted]]:
-    """Each link with the clock offset that the others give: degrees, shares, milliseconds (1, 50 and 99 %)."""
+    """Figures of each link with the clock offsets by the others: degrees, shares, milliseconds (1, 50 and 99 %)."""
     constant = [one_offset(recording) for recording in recordings]
     links, fits = [], []
     for k, recording in enumerate(recordings):

@@ -1,16 +1,17 @@
 """Clocks, alignment and angles of inertial sensors in two real recordings.
 
-two_arm_imus: two sensors on one arm, with clocks 11.03 s apart. The offset from the motion alone; then aligned at the
-first instants, which are the T-pose, how far the upper arm's direction is from that pose each time that it comes back
-through it. The arm never stops, so that each is a person's own as well as ours.
+two_arm_imus: two sensors on one arm, with clocks 11.03 s apart. The clock offset is found from the motion alone. The
+sensors are then aligned at the first instants, which are the T-pose; the figures are the angles between the upper arm's
+direction and that pose each time that it passes through it. The arm never stops, so that the person's own deviations
+are included.
 
 xsens_upper_body: ISB angles of the segments of an Xsens MVN suit from its sensors' orientations, against the joint
-angles that the file states. Its own conventions, all taken from the file: its segments are zero in the T-pose (frame
-"tpose") and its joints in "tpose-isb", so that a constant rotation leads from one to the other, and a quarter turn of
-pronation to ours; the shoulder is stated against the clavicle (jT4Shoulder) and in ZXY, so that both joints are
-combined and expressed as YXY against the thorax; and abduction is positive on both sides, so that x is the opposite on
-the right, y on the left. The file has no sensor orientation in the T-pose: the alignment that MVN found there is read
-off the first half second, and the rest is judged.
+angles in the file. Its own conventions, all taken from the file: its segments are zero in the T-pose (frame "tpose")
+and its joints in "tpose-isb", so that a constant rotation leads from one to the other, and a quarter turn of pronation
+to ours; the shoulder is stated against the clavicle (jT4Shoulder) and in ZXY, so that both joints are combined and
+expressed as YXY against the thorax; and abduction is positive on both sides, so that x has the opposite sign on the
+right, y on the left. The file has no sensor orientation in the T-pose: MVN's alignment is recovered from the first half
+second; the figures are of the rest.
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ def read_two_arm(path: Path) -> tuple[Stream, Stream]:
 
 
 def two_arm(path: Path) -> dict[str, Any]:
-    """Clock and return to the T-pose."""
+    """Figures of the clock and of the returns to the T-pose."""
     upper, lower = read_two_arm(path)
     found = clock_offset(turning_of_sensor(upper.stamps, upper.rates), turning_of_sensor(lower.stamps, lower.rates))
     figures: dict[str, Any] = {"clock_found": found is not None}
@@ -91,7 +92,7 @@ def two_arm(path: Path) -> dict[str, Any]:
     begin = max(stream.stamps[0] for stream in streams)
     pose = pose_rotations(MODEL, "t")[[SEGMENTS.index(name) for name in segments]]
     measured = np.array([so3.mean_rotation(stream.between(begin, begin + 0.1).rotations) for stream in streams])
-    # nobody knows how these were put on; both have magnetometers: a common heading, any, and 10 degrees of each
+    # the mounting is unknown; with magnetometers, any common heading, and 10 degrees for each sensor
     headings = np.pi**2 / 3.0 + np.radians(10.0) ** 2 * np.eye(2)
     alignment = align_in_pose(
         segments,
@@ -104,7 +105,7 @@ def two_arm(path: Path) -> dict[str, Any]:
     for number, stream in enumerate(streams):
         world = alignment.oriented(number, stream.rotations)
         along = -world[:, :, 2]
-        # sideways and back: the right arm points to -y in the T-pose
+        # azimuth from the T-pose: the right arm points to -y there
         azimuth = np.arctan2(along[:, 0], -along[:, 1])
         back = np.flatnonzero((azimuth[:-1] * azimuth[1:] <= 0.0) & (np.abs(azimuth[:-1]) < 1.0))
         back = back[stream.stamps[back] > begin + 1.0]
@@ -132,7 +133,7 @@ ALIGNED_FRAMES = 30
 
 
 def read_xsens(path: Path) -> dict[str, Any]:
-    """Rotations of segments and sensors and angles by name: of all frames, and of the poses before them."""
+    """By name, rotations of segments and sensors and angles of all frames, and segments in the poses before them."""
     recording = MvnxRecording(path)
     frames: dict[str, list[MvnxFrame]] = {}
     for frame in recording.frames():
@@ -155,7 +156,7 @@ def read_xsens(path: Path) -> dict[str, Any]:
 
 
 def to_ours(data: dict[str, Any], segment: str) -> FloatArray:
-    """(3, 3) the constant that leads from the file's frame of a segment to ours: T-pose frame, ISB frame, pronation."""
+    """(3, 3) rotation from the file's frame of a segment to ours: T-pose frame, ISB frame, pronation."""
     name = XSENS_SEGMENTS[segment]
     constant = data["tpose"][name].T @ data["isb"][name]
     if segment.startswith(("forearm", "hand")):  # ISB's zero has the palm forward, ours the thumb
@@ -165,23 +166,23 @@ def to_ours(data: dict[str, Any], segment: str) -> FloatArray:
 
 
 def stated_rotation(data: dict[str, Any], joint: str) -> FloatArray:
-    """(n, 3, 3) a joint's rotation in ISB axes, from the file's own angles: about z, then x, then y."""
+    """(n, 3, 3) a joint's rotation in ISB axes, from the file's angles: about z, then x, then y."""
     x, y, z = data["angles"][joint].T
     x, y = (-x, y) if "Right" in joint else (x, -y)
     return Rotation.from_euler("ZXY", np.stack([z, x, y], axis=-1)).as_matrix()
 
 
 def stated_angles(data: dict[str, Any], side: str) -> dict[str, FloatArray]:
-    """(n,) radians of the file's own angles, in the words of our convention ``isb``."""
+    """(n,) the file's angles by the names of our convention ``isb``, radians."""
     title = side.title()
     elbow = data["angles"][f"j{title}Elbow"]
-    # of the shoulder both joints together, mirrored on the left as ISB prescribes
+    # both joints of the shoulder together, mirrored on the left as ISB prescribes
     humerus = stated_rotation(data, f"j{title}T4Shoulder") @ stated_rotation(data, f"j{title}Shoulder")
     if side == "left":
         mirror = np.diag([1.0, 1.0, -1.0])
         humerus = mirror @ humerus @ mirror
     plane, elevation, rotation = Rotation.from_matrix(humerus).as_euler("YXY").T
-    # of the two solutions that with a negative elevation
+    # choose the solution with a negative elevation
     flip = np.where(elevation > 0.0, np.pi, 0.0)
     return {
         f"elbow_flexion_{side}": elbow[:, 2],
@@ -193,7 +194,7 @@ def stated_angles(data: dict[str, Any], side: str) -> dict[str, FloatArray]:
 
 
 def isb_angles(rotations: FloatArray) -> tuple[FloatArray, list[str]]:
-    """(n, 3 c) radians of the c chains of convention ``isb``, continuous over (n, 12, 3, 3), and their names or ""."""
+    """(n, 3 c) angles of the c chains of convention ``isb`` over (n, 12, 3, 3), continuous, rad; names or ``""``."""
     isb = convention("isb", MODEL)
     ((sequences, parents, children, rows),) = isb.stages
     place = {row - rows.start: name for row, name in zip(isb.rows.tolist(), isb.names, strict=True)}
@@ -206,7 +207,7 @@ def isb_angles(rotations: FloatArray) -> tuple[FloatArray, list[str]]:
 
 
 def xsens(path: Path) -> dict[str, Any]:
-    """RMS of each angle from sensors against the file's own, degrees."""
+    """RMS differences of each angle between sensors and file, degrees."""
     data = read_xsens(path)
     count = len(data["sensors"]["Pelvis"])
     theirs, ours = np.full((2, count, 12, 3, 3), np.nan)
@@ -245,7 +246,7 @@ def angles_in(figures: dict[str, Any]) -> dict[str, dict[str, float]]:
 
 
 def bars(two: dict[str, Any], suit: dict[str, Any]) -> dict[str, bool]:
-    """Which are met."""
+    """Whether each bar is met."""
     met = {"clock offset": two["clock_found"] and abs(two["offset_error_s"]) <= CLOCK_BAR_S}
     if two["clock_found"]:
         row = two["upper_arm_right"]

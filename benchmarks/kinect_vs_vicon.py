@@ -2,32 +2,32 @@
 
 The clips are exercises of the right arm of five people (UI-PRMD, Vakanski et al. 2018), each recorded by both systems.
 Filters run with and without the correction of a Kinect's arms and spine (``calibration.arm_directions``,
-``calibration.kinect_spine``), of which the law of the arms is fitted leaving out the subject it is tried on; ``--fit``
-prints the law of all subjects, which is the shipped one. The table holds the
-median over subjects of their clips' medians, and of these the ratio to the raw skeleton; stddev is the median of the
-published standard deviations (linear filters: positional angles; ``ekf``: convention ``isb``), and coverage the share
-of all frames of a subject whose error lies within 1.96 of it, mean over subjects. (Coverage of the median clip, which
-the last column shows, is no measure of it: errors persist throughout a clip, so that the median clip has all of its
-frames inside although those of all clips together have 95 %.) The linear filters' deviations depend on the correlation
-of neighbouring joints' errors (``core.measurement``), which is fitted without that subject, too; ``ekf`` has the
-shipped one. Rate is the RMS of the angle's error differentiated by time, degrees per second; ``--lag`` adds rows with
-smoothing (``filters.smoothing``). Clips whose time warp explains less than 0.9 are left out. Last, for the rows of
-``ekf``, the flexion of the trunk against the pelvis (convention ``model``) of these people, who stand upright: the
-median over the second halves of a subject's clips.
+``calibration.kinect_spine``). The law of the arms is fitted without the subject on whom it is evaluated; ``--fit``
+prints the law of all subjects, which is the shipped one. The table holds the median over subjects of their clips'
+medians, and its ratio to that of the raw skeleton. stddev is the median of the published standard deviations (linear
+filters: positional angles; ``ekf``: convention ``isb``). Coverage is the share of all frames of a subject with an error
+within 1.96 of it, mean over subjects. (The coverage of the median clip, in the last column, does not measure it: errors
+persist throughout a clip, so that the median clip has all of its frames inside although 95 % of the frames of all clips
+are.) The linear filters' standard deviations depend on the correlation of neighbouring joints' errors
+(``core.measurement``), which is also fitted without that subject; ``ekf`` has the shipped one. Rate is the RMS of the
+angle error's time derivative, degrees per second; ``--lag`` adds rows with smoothing (``filters.smoothing``). Clips
+whose time warp explains less than 0.9 are left out. Last, for the rows of ``ekf``, the flexion of the trunk against the
+pelvis (convention ``model``) of these people, who stand upright: the median over the second halves of a subject's
+clips.
 
 Angles. Elevation: upper arm against the trunk axis, 0 hanging; flexion: forearm against upper arm, 0 straight. Kinect:
 the lines between the joints, trunk axis from SpineMid to SpineShoulder. Vicon: from joint centres that are computed
 from the markers. The trunk axis runs from the middle of T10 and STRN to the middle of C7 and CLAV (ISB's y axis of the
 thorax, Wu 2005, with T10 for T8 and STRN for the xiphoid process). The shoulder lies below the acromion along the trunk
-axis (Rab 2002) by 12 % of the distance between the acromia: among all shares this one keeps the upper arm's length the
-most constant over the raised arm (Rab's 17 %: up to 14 mm of standard deviation instead of 3). The elbow lies half an
-elbow's width from its lateral marker, at a right angle to the upper arm and towards the body, along the normal of the
-plane of shoulder, elbow marker and wrist (Plug-in Gait's chord function). The wrist is the middle of WRA and WRB.
+axis (Rab 2002) by 12 % of the distance between the acromia: of all shares this one gives the smallest variation of the
+upper arm's length over the raised arm (Rab's 17 %: up to 14 mm of standard deviation instead of 3). The elbow lies half
+an elbow's width from its lateral marker, at a right angle to the upper arm and towards the body, along the normal of
+the plane of shoulder, elbow marker and wrist (Plug-in Gait's chord function). The wrist is the middle of WRA and WRB.
 
-Time. Neither system left stamps, and the clips were cut separately, so a smooth warp of six parameters is estimated
-(``time_warp``) from the directions of upper arm and forearm in the thorax's axes. One warp serves all
-methods of a clip, estimated from all but the smoothed ones together: all are compared over the same frames, none is
-favoured, and a lag counts as the error that it is. The law is fitted by the warp of the raw skeleton alone.
+Time. Neither system recorded stamps, and the clips were cut separately, so a smooth warp of six parameters is estimated
+(``time_warp``) from the directions of upper arm and forearm in the thorax's axes. Each clip has one warp, estimated
+from all methods but the smoothed ones together: all methods are compared over the same frames, none has an advantage,
+and a lag counts as an error. The law is fitted with the warp of the raw skeleton alone.
 """
 
 from __future__ import annotations
@@ -59,21 +59,21 @@ from body_tracking.kinematics.conventions import angles_of
 from body_tracking.kinematics.positional import positional_angles
 
 KINECT_RATE, VICON_RATE = 30.0, 100.0
-"""Nominal, Hz."""
+"""Nominal frame rates, Hz."""
 
 PERIODIC = ("m09",)
-"""Rotation of the raised arm: Kinect's clip begins with the forearm up, Vicon's, half a cycle apart, forward."""
+"""Clips of rotation of the raised arm: the Kinect's begins with the forearm up, Vicon's half a cycle apart, forward."""
 
 ACROMION_TO_SHOULDER = 0.12
-"""Shoulder centre below the acromion marker, in distances between the acromia."""
+"""Distance of the shoulder centre below the acromion marker, as a share of the distance between the acromia."""
 HALF_ELBOW = 0.040
-"""Elbow centre from the middle of its lateral marker, m: half the width of a grown person's elbow and of the marker."""
+"""Distance of the elbow centre from its lateral marker's centre, m: half the width of an adult's elbow and marker."""
 
 ANGLES = ("elevation", "flexion")
 _NAMES = ("shoulder_elevation_right", "elbow_flexion_right")
-"""The published ones."""
+"""Names of the published angles."""
 _EVERY = 30
-"""Every thirtieth frame fits the correlation: errors of frames that follow each other hardly differ."""
+"""Every thirtieth frame is used to fit the correlation: errors of consecutive frames hardly differ."""
 RAW = "raw"
 Methods = dict[str, tuple[str, bool, float]]
 METHODS: Methods = {
@@ -82,22 +82,22 @@ METHODS: Methods = {
     f"{DEFAULT_FILTER}, no law": (DEFAULT_FILTER, False, 0.0),
     "ekf, no law": ("ekf", False, 0.0),
 }
-"""Filters at their default settings, from each clip's first frame on, with and without the law, and the lag in s."""
+"""Filters at their default settings, from each clip's first frame on; whether with the law; the lag in s."""
 HELD = (DEFAULT_FILTER, "ekf")
-"""Those that are held to the bars."""
+"""Filters to which the bars apply."""
 LEAST_EXPLAINED = 0.9
 BARS = {"elevation": 0.80, "flexion": 0.70}
-"""Most that the median of the RMS may be of the raw skeleton's."""
+"""Largest ratio of the median RMS to the raw skeleton's."""
 WORSE = 0.5
-"""Degrees by which no subject's RMS may exceed the raw skeleton's."""
+"""Largest excess of a subject's RMS over the raw skeleton's, degrees."""
 COVERAGE = (0.88, 0.99)
-"""Of the 95 % bands."""
+"""Bounds of the coverage of the 95 % bands."""
 
 KINECT_JOINTS = {
     "waist": Joint.SPINE_BASE,
     "spine": Joint.SPINE_MID,
     "chest": Joint.SPINE_SHOULDER,
-    # "neck" lies at a tenth of the way from chest to "head", and so do the collars: made up by the recording program
+    # "neck" lies at a tenth of the way from chest to "head", as do the collars: the recording program computes them
     "head": Joint.NECK,
     "head_tip": Joint.HEAD,
     "left_upper_arm": Joint.SHOULDER_LEFT,
@@ -115,7 +115,7 @@ KINECT_JOINTS = {
     "right_foot": Joint.ANKLE_RIGHT,
     "right_toes": Joint.FOOT_RIGHT,
 }
-"""The recording program's names (each of a segment, at its near end) and the joint of the SDK at that place."""
+"""Names of the recording program (of segments, at their proximal ends), and the SDK's joints at these places."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ class Arm:
 
 
 def read(path: Path) -> dict[str, FloatArray]:
-    """Named points of a clip, (n, 3) metres each."""
+    """Named points of a clip, (n, 3) each, metres."""
     with gzip.open(path, "rt", newline="") as stream:
         rows = csv.reader(stream)
         header = next(rows)
@@ -150,7 +150,7 @@ def kinect_skeletons(path: Path) -> list[Skeleton]:
     positions = np.full((frames, N_JOINTS, 3), np.nan)
     for name, joint in KINECT_JOINTS.items():
         positions[:, joint] = points[name]
-    # the file's x is to the person's left and its z towards the sensor: camera space turned by half a turn about y
+    # the file's x points to the person's left, z towards the sensor: camera space turned by half a turn about y
     optical = camera_space_to_optical(positions * [-1.0, 1.0, -1.0])
     world = np.stack([optical[..., 2], -optical[..., 0], -optical[..., 1]], axis=-1)
     states = np.full(N_JOINTS, TrackingState.NOT_TRACKED, dtype=np.uint8)
@@ -186,7 +186,7 @@ def _arm(
 
 
 def kinect_arm(skeletons: list[Skeleton]) -> Arm:
-    """The arm in skeletons."""
+    """The right arm from skeletons."""
     times = np.array([each.stamp for each in skeletons])
     p = np.stack([each.positions for each in skeletons], axis=1)
     return _arm(
@@ -200,7 +200,7 @@ def kinect_arm(skeletons: list[Skeleton]) -> Arm:
 
 
 def vicon_arm(path: Path) -> Arm:
-    """The arm's joint centres from the markers."""
+    """The right arm from joint centres by the markers."""
     m = read(path)
     up = _unit(m["C7"] + m["CLAV"] - m["T10"] - m["STRN"])
     left = np.cross(up, m["CLAV"] + m["STRN"] - m["C7"] - m["T10"])
@@ -210,7 +210,7 @@ def vicon_arm(path: Path) -> Arm:
     upper, forearm = shoulder - m["RELB"], wrist - m["RELB"]
     medial = _unit(np.cross(upper, forearm))  # of the right arm
     length = np.linalg.norm(upper, axis=-1, keepdims=True)
-    # the centre sees shoulder and marker under a right angle (Thales)
+    # the angle at the elbow centre between shoulder and marker is a right angle (Thales)
     sine = HALF_ELBOW / length
     elbow = m["RELB"] + HALF_ELBOW * (np.sqrt(1.0 - sine**2) * medial + sine * upper / length)
     return _arm(np.arange(len(up)) / VICON_RATE, up, left, shoulder, elbow, wrist)
@@ -222,9 +222,9 @@ class Filtered:
 
     Attributes:
         skeletons: one per frame.
-        published: (n, 2) degrees: the published elevation and flexion of the right arm.
-        stddev: (n, 2) degrees, of these.
-        trunk: degrees, median flexion of the trunk in the second half; NaN without a body model.
+        published: (n, 2) published elevation and flexion of the right arm, degrees.
+        stddev: (n, 2) their standard deviations, degrees.
+        trunk: median flexion of the trunk in the second half, degrees; NaN without a body model.
     """
 
     skeletons: list[Skeleton]
@@ -236,7 +236,7 @@ class Filtered:
 def _outputs(
     skeletons: list[Skeleton], chosen: SkeletonFilter, lag: float
 ) -> Iterator[tuple[Skeleton, ModelEstimate | None]]:
-    """The output of a filter, smoothed with a lag in s unless that is 0."""
+    """Output of a filter, smoothed with a lag in s unless it is 0."""
     if lag:
         assert isinstance(chosen, SmoothableFilter)
         held = FixedLag(chosen, lag)
@@ -254,7 +254,7 @@ def _outputs(
 
 
 def filtered(skeletons: list[Skeleton], name: str, of_bones: float, lag: float = 0.0) -> Filtered:
-    """Run a filter over skeletons; ``of_bones`` as of ``positional_angles``, the lag of smoothing in s."""
+    """Filter skeletons; ``of_bones`` as for ``positional_angles``, the lag of smoothing in s."""
     chosen = make_filter(name)
     found, angles = [], None
     published, stddev, trunk = [], [], []
@@ -275,7 +275,7 @@ def filtered(skeletons: list[Skeleton], name: str, of_bones: float, lag: float =
 
 
 def align(arms: list[Arm], vicon: Arm, clip: str) -> TimeWarp:
-    """Kinect's times to Vicon's: the one warp that suits the directions of all these arms together."""
+    """The one warp from Kinect's times to Vicon's that fits the directions of all these arms together."""
     times = arms[0].times
     directions = np.concatenate([sample(times, arm.times, arm.directions) for arm in arms], axis=1)
     known = np.isfinite(directions).all(axis=1)
@@ -286,11 +286,11 @@ def align(arms: list[Arm], vicon: Arm, clip: str) -> TimeWarp:
 
 
 def lag(arm: Arm, raw: Arm) -> float:
-    """Seconds by which the directions follow the raw ones (least squares over shifts)."""
+    """Delay of the directions against the raw ones, seconds (least squares over shifts)."""
     shifts = np.arange(-0.05, 0.2, 0.001)
 
     def apart(shift: float) -> float:
-        # all shifts are compared over the same frames
+        # compare all shifts over the same frames
         inside = (arm.times - shifts[-1] >= raw.times[0]) & (arm.times - shifts[0] <= raw.times[-1])
         there = sample(arm.times[inside] - shift, raw.times, raw.directions)
         return float(np.nanmean((arm.directions[inside] - there) ** 2))
@@ -300,15 +300,15 @@ def lag(arm: Arm, raw: Arm) -> float:
 
 @dataclass(frozen=True)
 class Clip:
-    """A clip of both systems, and their directions at the same instants by the warp of the raw skeleton.
+    """A clip of both systems, with directions at the same instants by the warp of the raw skeleton.
 
     Attributes:
         name: movement, subject and episode.
         folder: of the recordings.
-        explained: share of the variance that the warp explains.
+        explained: share of the variance explained by the warp.
         kinect, vicon: (n, 2, 3) directions of upper arm and forearm.
-        skeletons: n, of the Kinect.
-        angles: (n, 2) degrees by Vicon, those of ``ANGLES``; NaN outside its clip.
+        skeletons: (n,) of the Kinect.
+        angles: (n, 2) Vicon's ``ANGLES``, degrees; NaN outside its clip.
     """
 
     name: str
@@ -325,7 +325,7 @@ class Clip:
 
 
 def load(file: Path) -> Clip:
-    """The Kinect's file of a clip and its Vicon one, aligned."""
+    """Read and align a clip's files of Kinect and Vicon."""
     name = file.name.removesuffix("_kinect.csv.gz")
     skeletons = kinect_skeletons(file)
     raw, vicon = kinect_arm(skeletons), vicon_arm(file.with_name(f"{name}_vicon.csv.gz"))
@@ -343,15 +343,15 @@ def load(file: Path) -> Clip:
 
 
 def law_of(clips: list[Clip]) -> ArmLaw:
-    """Fitted to these clips."""
+    """Law fitted to these clips."""
     return fit_arm_law([(each.subject, each.kinect, each.vicon) for each in clips])
 
 
 def correlation_of(clips: list[Clip]) -> float:
-    """Correlation of a bone's two joints with which the squared errors of both angles are as large as stated.
+    """Correlation of the errors of a bone's two joints for which both angles' squared errors match the stated variance.
 
-    The errors are those that the law leaves in a subject whom it was not fitted to. Subjects, and the clips of one,
-    weigh alike.
+    The errors are those left by the law in a subject to whom it was not fitted. All subjects have the same weight, and
+    so have all clips of a subject.
     """
     errors, frames = [], []
     for clip in clips:
@@ -371,7 +371,7 @@ def correlation_of(clips: list[Clip]) -> float:
 
 
 def _positional(skeletons: list[Skeleton], of_bones: float) -> tuple[FloatArray, FloatArray]:
-    """(n, 2) degrees of the right arm's ``ANGLES``, and (n, 2) their deviations."""
+    """(n, 2) the right arm's ``ANGLES``, and (n, 2) their standard deviations; degrees."""
     angles = [positional_angles(each, of_bones) for each in skeletons]
     columns = [angles[0].names.index(name) for name in _NAMES]
     return tuple(
@@ -380,7 +380,7 @@ def _positional(skeletons: list[Skeleton], of_bones: float) -> tuple[FloatArray,
 
 
 def measure(job: tuple[Clip, ArmLaw, float, Methods]) -> dict[str, Any]:
-    """All figures of one clip: per method and angle the agreement and the coverage, and the lag."""
+    """All figures of one clip: agreement and coverage per method and angle, and the lag."""
     clip, law, of_bones, methods = job
     skeletons = clip.skeletons
     vicon = vicon_arm(clip.folder / f"{clip.name}_vicon.csv.gz")
@@ -390,7 +390,7 @@ def measure(job: tuple[Clip, ArmLaw, float, Methods]) -> dict[str, Any]:
         for name, (own, with_law, lag) in methods.items()
     }
     arms = {RAW: kinect_arm(skeletons)} | {name: kinect_arm(each.skeletons) for name, each in outputs.items()}
-    # rows that are asked for do not change the other ones
+    # rows requested by options must not change the others
     warp = align([arms[name] for name in (RAW, *METHODS)], vicon, clip.name)
     figures: dict[str, Any] = {"clip": clip.name, "subject": clip.subject, "explained": warp.explained}
     for name, arm in arms.items():
@@ -415,7 +415,7 @@ def measure(job: tuple[Clip, ArmLaw, float, Methods]) -> dict[str, Any]:
 
 
 def main() -> int:
-    """The benchmark; exit code 1 where a figure misses its bar."""
+    """The benchmark; exit code 1 where a bar is missed."""
     parser = common.parser(__doc__, jobs=True, data=True)
     parser.add_argument("--fit", action="store_true", help="print the law of all subjects, and end")
     parser.add_argument(
@@ -451,7 +451,7 @@ def main() -> int:
 
 
 def _summary(rows: list[dict[str, Any]], subjects: list[str], name: str, angle: str) -> dict[str, Any]:
-    """Medians over subjects of the medians over clips; ``of_raw`` is the RMS as a share of the raw skeleton's."""
+    """Medians over subjects of the medians over clips; ``of_raw`` is the RMS as a ratio to the raw skeleton's."""
 
     def by_subject(key: str, method: str = name) -> list[float]:
         return [median(row[method][angle][key] for row in rows if row["subject"] == each) for each in subjects]
@@ -492,7 +492,7 @@ def show(
     correlations: dict[str, float],
     trunks: dict[str, list[float]],
 ) -> None:
-    """The table, errors by subject, and the trunks."""
+    """Print the table, errors by subject, and the trunk flexions."""
     print(f"{used} of {of} clips, {len(correlations)} subjects; degrees")
     print("correlation of a bone's joints without each: " + " ".join(f"{each:.3f}" for each in correlations.values()))
     columns = (

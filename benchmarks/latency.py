@@ -1,10 +1,10 @@
 """The delay from capture to joint angles through the real processes, beside a chain of bare relays.
 
-Two sensors of 30 Hz that run apart, as two Kinects do (every phase between them occurs), feed the graph's own
-calibration, fusion, filter and angle nodes. Beside them, in the same run and half a frame later each time, the same
-skeleton goes through as many processes that do nothing but publish a ready message of the same type and size for each
-that comes: what a chain of rclpy nodes costs by itself. Delays are from just before a frame is published until its
-angles are received, by one clock, in one process.
+Two sensors of 30 Hz with different periods, as two Kinects have (every phase between them occurs), feed the graph's own
+calibration, fusion, filter and angle nodes. In the same run, half a frame later each time, the same skeleton passes
+through as many relay processes. For each message, a relay only publishes a prepared message of the same type and size:
+its delay is that of a chain of rclpy nodes by itself. Delays are from just before a frame is published until its angles
+are received, by one clock, in one process.
 """
 
 from __future__ import annotations
@@ -46,19 +46,19 @@ BAG = common.ROOT / "bags" / "tpose_wave"
 SENSORS = ("kinect1", "kinect2")
 CHAIN = ("fusion", "skeleton_filter", "joint_angles")
 PERIODS = (1.0 / 30.0, 1.0 / 29.7)
-"""Seconds: the phase between the sensors goes once around in some 3 s."""
+"""Periods of the sensors, seconds: the phase between them wraps around in about 3 s."""
 
 RELAYED = ("/relay/sensor", "/relay/fused", "/relay/filtered", "/relay/joint_states")
 LISTENERS = {graph.FUSED: 1, graph.FILTERED: 1, **{graph.skeleton_topic(name): 2 for name in SENSORS}}
-"""Of each topic of the graph, once it is there."""
+"""Number of subscribers of each topic once the graph is up."""
 TARGETS = {"median": 2.0, "p99": 2.5}
 
 
-# --- the relays: the other end of this file, one process each
+# --- the relays: this file as a command, one process each
 
 
 def relay(stage: int) -> None:
-    """Publish a ready message of the stage's own type and size for each that comes, with its stamp."""
+    """For each received message, publish a prepared message of the stage's type and size with the same stamp."""
     die_with_parent()
     rclpy.init()
     node = rclpy.create_node(f"relay{stage}")
@@ -87,7 +87,7 @@ def relay(stage: int) -> None:
 
 
 def _sample(stage: int) -> Skeleton:
-    """A skeleton of the kind that the graph's node of this stage sends (the last one: receives)."""
+    """A skeleton of the kind that the graph's node of this stage publishes (the last one: receives)."""
     positions = np.random.default_rng(0).normal(size=(25, 3))
     covariances = np.broadcast_to(np.eye(3) * 1e-4, (25, 3, 3)).copy()
     velocities = np.zeros((25, 3)) if stage > 0 else None
@@ -103,7 +103,7 @@ def relay_commands() -> list[list[str]]:
 
 
 def recorded() -> tuple[dict[str, live.Stream], dict[str, SensorPose]]:
-    """Frames of a shipped recording, and where its sensors really stood."""
+    """Frames of a shipped recording, and the true poses of its sensors."""
     frames: dict[str, list[tuple[Skeleton, ...]]] = {name: [] for name in SENSORS}
     poses: dict[str, SensorPose] = {}
     clocks = {name: ClockModel() for name in SENSORS}
@@ -120,7 +120,7 @@ def recorded() -> tuple[dict[str, live.Stream], dict[str, SensorPose]]:
 
 
 def events(streams: Mapping[str, live.Stream], relays: bool = True) -> Iterator[live.Event]:
-    """Frames of both sensors for ever, and for the relays those of the first one, half a frame later."""
+    """Endless frames of both sensors, and for the relays those of the first one, half a frame later."""
 
     def regular(topic: str, stream: live.Stream, period: float, phase: float) -> Iterator[live.Event]:
         return (((k + phase) * period, topic, stream.at((k + phase) * period)) for k in itertools.count())
@@ -135,7 +135,7 @@ def events(streams: Mapping[str, live.Stream], relays: bool = True) -> Iterator[
 
 
 def bench_of_graph(name: str) -> live.Bench:
-    """A node that sends what both sensors say, and takes the time of joint angles."""
+    """A node that publishes the skeletons of both sensors, and notes the receipt of joint angles."""
     bench = live.Bench(name)
     for sensor in SENSORS:
         bench.publisher(graph.skeleton_topic(sensor), PointCloud2)
@@ -178,7 +178,7 @@ def measure(seconds: float, warm_up: float) -> dict[str, Any]:
 
 
 def main() -> int:
-    """The command: 0, also when a target is missed; the figures say it."""
+    """The command; the exit code is 0 even if a target is missed."""
     parser = common.parser(__doc__)
     parser.add_argument("--seconds", type=float, default=40.0, help="to measure (default: %(default)g)")
     parser.add_argument("--warm-up", type=float, default=3.0, help="before that, not measured (default: %(default)g)")

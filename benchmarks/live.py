@@ -1,6 +1,6 @@
-"""Live benchmarks: the graph's nodes as processes, and a node that takes the sensors' place and the time of what comes.
+"""Live benchmarks: the graph's nodes as processes, and a node that replaces the sensors and times received messages.
 
-Imported before rclpy: the ROS domain is one of its own, and stays on this machine.
+Import it before rclpy: it selects a random ROS domain that is limited to this machine.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ from body_tracking.ros.bag_topics import to_profile
 from body_tracking.systems import nodes_for
 
 STAMP = struct.Struct("<iI")
-"""Behind the encapsulation (4 bytes): every message here begins with its header."""
+"""Stamp of a message, behind the encapsulation (4 bytes): every message here begins with its header."""
 
 Event = tuple[float, str, bytearray]
-"""Seconds, topic, and message as CDR, whose stamp is set when it is sent: a driver costs little, and so must this."""
+"""Seconds, topic, and message as CDR. The stamp is set at sending: a driver is cheap, and so must this be."""
 
 # --- processes
 
@@ -58,9 +58,9 @@ def calibrated(
     clocks: Mapping[str, ClockModel] | None = None,
     drift_ppm: float = np.inf,
 ) -> str:
-    """Write the calibration of sensors that stand there, and share a clock unless theirs are given; its path.
+    """Write the calibration of sensors at these poses, with these clocks (default: one clock); returns its path.
 
-    ``drift_ppm``: the standard deviation of the clocks' drifts.
+    ``drift_ppm``: standard deviation of the clocks' drifts.
     """
     own = {name: ClockModel() for name in poses} | dict(clocks or {})
     quality = {name: SensorQuality(0.03, 0.005, 0.01, 0.002, 500, drift_ppm) for name in poses}
@@ -69,12 +69,12 @@ def calibrated(
 
 
 def node_commands(folder: Path, options: Options, level: str = "WARN") -> list[list[str]]:
-    """Command lines of the nodes of a graph without its Kinects: the benchmark takes their place.
+    """Command lines of a graph's nodes without its Kinects, which the benchmark replaces.
 
     Args:
-        folder: where their parameters are written.
-        options: the graph.
-        level: what they log.
+        folder: for files with the nodes' parameters.
+        options: of the graph.
+        level: of logging.
     """
     lines = []
     for spec in nodes_for(options):
@@ -88,7 +88,7 @@ def node_commands(folder: Path, options: Options, level: str = "WARN") -> list[l
 
 
 def parameters_file(file: Path, values: Mapping[str, Mapping[str, Any]]) -> str:
-    """Write parameters of nodes, by their names; its path."""
+    """Write parameters by name of node; returns the path."""
     sections = {name: {SECTION: dict(each)} for name, each in values.items()}
     file.write_text(yaml.safe_dump(sections), encoding="utf-8")
     return str(file)
@@ -98,12 +98,12 @@ def parameters_file(file: Path, values: Mapping[str, Mapping[str, Any]]) -> str:
 def processes(
     lines: Iterable[Sequence[str]], log: Path | None = None, patience: float = 30.0, **options: Any
 ) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """A process for each command line, which ends when this process does; in the end all end as Ctrl-C does.
+    """A process for each command line. It ends with this process; at the end of the context all get SIGINT.
 
     Args:
         lines: the commands.
-        log: file for all that they print; None for this process's own output.
-        patience: seconds until those that do not end are killed.
+        log: file for all output; None for this process's own output.
+        patience: seconds until processes that do not end are killed.
         options: of ``Popen``.
     """
     environment = {**os.environ, graph.PARENT_VARIABLE: str(os.getpid())}
@@ -126,7 +126,7 @@ def processes(
 
 
 def up_command(*words: object) -> list[str]:
-    """``body_tracking up``, which ends its nodes itself."""
+    """Command line of ``body_tracking up``, which ends its nodes itself."""
     return [sys.executable, "-m", "body_tracking.cli", "up", *(str(word) for word in words)]
 
 
@@ -137,10 +137,17 @@ def wait(
     seconds: float = 60.0,
     log: Path | None = None,
 ) -> None:
-    """Until it is ready; ``log``: what to show of it where it is not.
+    """Wait until ``ready``.
+
+    Args:
+        what: name of the awaited thing, for the error.
+        ready: whether it is up.
+        running: processes that must not end meanwhile.
+        seconds: time limit.
+        log: file whose end the error quotes.
 
     Raises:
-        SystemExit: it takes too long, or a process ends.
+        SystemExit: time is up, or a process ended.
     """
     end, running = time.monotonic() + seconds, list(running)
     while not ready():
@@ -150,7 +157,7 @@ def wait(
 
 
 def nodes_of(pid: int) -> dict[str, psutil.Process]:
-    """The node processes that ``body_tracking up`` has started, by name."""
+    """The node processes started by ``body_tracking up``, by name."""
     found = {}
     for process in psutil.Process(pid).children():
         with contextlib.suppress(psutil.Error):
@@ -162,7 +169,7 @@ def nodes_of(pid: int) -> dict[str, psutil.Process]:
 
 
 def cpu_seconds(process: psutil.Process, children: bool = False) -> FloatArray:
-    """(2,) seconds of user and system time, with those of its children where these are asked for."""
+    """(2,) user and system time, seconds; with that of its children if requested."""
     times = [each.cpu_times() for each in (process, *(process.children(recursive=True) if children else ()))]
     return np.array([[each.user, each.system] for each in times]).sum(axis=0)
 
@@ -171,12 +178,12 @@ def cpu_seconds(process: psutil.Process, children: bool = False) -> FloatArray:
 
 
 class Ear:
-    """Takes the time of what comes, and keeps the latest diagnostics.
+    """Subscriber that notes the receipt of messages, and keeps the latest diagnostics.
 
     Attributes:
         node: of this process.
-        received: by name and stamp (ns) the time of receipt (ns) by ``now``.
-        statuses: by node the wall time, s, and what it said last.
+        received: by name and stamp (ns), the time of receipt (ns) by ``now``.
+        statuses: by node, the wall time in s and its last diagnostics.
     """
 
     def __init__(self, name: str, now: Callable[[], int] = time.perf_counter_ns) -> None:
@@ -189,7 +196,7 @@ class Ear:
         self._now = now
 
     def time(self, name: str, topic: str, kind: type = JointState, qos: Any = RELIABLE) -> None:
-        """Note when each message of a topic comes first."""
+        """Note the first receipt of each stamp on a topic."""
         received = self.received.setdefault(name, {})
 
         def on_message(cdr: bytes) -> None:
@@ -199,26 +206,26 @@ class Ear:
         self.node.create_subscription(kind, topic, on_message, to_profile(qos), raw=True)
 
     def hear_diagnostics(self) -> None:
-        """Keep what nodes say of themselves."""
+        """Subscribe to the diagnostics."""
         self.node.create_subscription(
             DiagnosticArray, graph.DIAGNOSTICS_TOPIC, self.on_diagnostics, to_profile(RELIABLE)
         )
 
     def on_diagnostics(self, message: DiagnosticArray, _info: Any = None) -> None:
-        """One message."""
+        """Keep the statuses of one message."""
         for status in statuses(message):
             self.statuses[status.node] = time.time(), status
 
     def values(self, node: str) -> Mapping[str, str]:
-        """What a node said last."""
+        """Values of a node's last diagnostics."""
         return dict(self.statuses[node][1].values) if node in self.statuses else {}
 
     def number(self, node: str, key: str) -> float:
-        """One of these."""
+        """One value of a node's last diagnostics; 0 if absent."""
         return float(self.values(node).get(key, 0.0))
 
     def spin(self) -> None:
-        """Listen in a thread, until :meth:`close`."""
+        """Spin in a thread, until :meth:`close`."""
 
         def run() -> None:
             with contextlib.suppress(ExternalShutdownException):
@@ -227,16 +234,16 @@ class Ear:
         threading.Thread(target=run, daemon=True).start()
 
     def close(self) -> None:
-        """Leave the graph."""
+        """Shut rclpy down."""
         rclpy.try_shutdown()
 
 
 class Bench(Ear):
-    """Sends what sensors say at its time, too.
+    """Also publishes the sensors' messages in real time.
 
     Attributes:
-        sent: by name and stamp (ns) the time (ns) just before it was published.
-        start_ns: when second 0 was.
+        sent: by name and stamp (ns), the time just before publishing (ns).
+        start_ns: time of second 0.
     """
 
     def __init__(self, name: str) -> None:
@@ -246,23 +253,23 @@ class Bench(Ear):
         self._outputs: dict[str, Any] = {}
 
     def publisher(self, topic: str, kind: type, qos: Any = graph.SKELETON) -> None:
-        """Prepare to send messages of a topic, best effort unless another quality is given."""
+        """Create a publisher, best effort by default."""
         self._outputs[topic] = self.node.create_publisher(kind, topic, to_profile(qos))
 
     def connected(self, listeners: Mapping[str, int]) -> bool:
-        """Whether each topic has so many of them."""
+        """Whether each topic has at least this number of subscribers."""
         return all(self.node.count_subscribers(topic) >= count for topic, count in listeners.items())
 
     def publish(self, events: Iterable[Event], counted: Mapping[str, str], since: float = 0.0) -> list[float]:
-        """Send everything at its time, with its time as the stamp.
+        """Publish each event at its time, with its time as the stamp.
 
         Args:
-            events: in their order.
-            counted: by topic the name under which it is noted when a message was sent.
+            events: in the order of time.
+            counted: by topic, the name under which the time of sending is noted.
             since: seconds before which nothing is noted.
 
         Returns:
-            By how many milliseconds the sending was late.
+            Delay of each sending, milliseconds.
         """
         self.start_ns, late = time.perf_counter_ns() + NANOSECONDS // 10, []
         for at, topic, message in events:
@@ -277,7 +284,7 @@ class Bench(Ear):
         return late
 
     def delays_ms(self, name: str, begin_ns: float = 0, end_ns: float = np.inf) -> tuple[FloatArray, int]:
-        """(n,) delays of what was sent between two times and came, in the order of sending; how many did not come."""
+        """(n,) delays of received messages sent between two times, in the order of sending, ms; the number of lost."""
         sent = [(stamp, at) for stamp, at in sorted(self.sent.get(name, {}).items()) if begin_ns <= at < end_ns]
         received = self.received[name]
         delays = [received[stamp] - at for stamp, at in sent if stamp in received]
@@ -288,7 +295,7 @@ def percentiles(delays: FloatArray, what: str, late: int = 99) -> dict[str, floa
     """Median and a late percentile, ms.
 
     Raises:
-        SystemExit: there is nothing.
+        SystemExit: ``delays`` is empty.
     """
     if not len(delays):
         raise SystemExit(f"nothing came through {what}")
@@ -297,14 +304,16 @@ def percentiles(delays: FloatArray, what: str, late: int = 99) -> dict[str, floa
 
 
 class Stream:
-    """What one sensor saw, by time: between two frames, points are interpolated, since the calibration would find the
-    clock of a sensor whose frames show what was before or after their stamps.
+    """Skeletons of one sensor by time.
+
+    Positions are interpolated between two frames: with positions from before or after the stamps, the calibration would
+    estimate a wrong clock.
 
     Args:
         frames: (n,) the bodies in each frame.
         clock: of the sensor.
-        span: first and last time that all sensors saw, nanoseconds by the reference's clock, played forwards, then
-            backwards, so that nobody jumps.
+        span: first and last time seen by all sensors, ns by the reference's clock, played forwards, then backwards,
+            so that nobody jumps.
     """
 
     def __init__(self, frames: Sequence[Sequence[Skeleton]], clock: ClockModel, span: tuple[int, int]) -> None:
@@ -313,7 +322,7 @@ class Stream:
         self._span = span
 
     def at(self, seconds: float) -> bytearray:
-        """The message of a time since the start."""
+        """The message for a time since the start, in seconds."""
         first, length = self._span[0], self._span[1] - self._span[0]
         way = round(seconds * NANOSECONDS) % (2 * length)
         at = first + min(way, 2 * length - way)
@@ -331,7 +340,7 @@ class Stream:
 
 
 def streams(frames: Mapping[str, Sequence[Sequence[Skeleton]]], clocks: Mapping[str, ClockModel]) -> dict[str, Stream]:
-    """What each sensor saw of the time that all of them saw."""
+    """The stream of each sensor over the time seen by all of them."""
     ends = [[clocks[name].to_reference(own[index][0].stamp_ns) for name, own in frames.items()] for index in (0, -1)]
     span = (max(ends[0]), min(ends[1]))
     return {name: Stream(own, clocks[name], span) for name, own in frames.items()}

@@ -1,21 +1,22 @@
 """Accuracy of the marker system beside the figures of Gaschler (2011), chapter 6.
 
-Balls with modelled noise of the centroids (0.1 pixels, his section 6.1) and corners with that of his boards (0.06):
+Simulated balls with a noise of the centroids of 0.1 pixels (his section 6.1), and corners with that of his boards
+(0.06):
 
-a. a target of five balls, 98 mm, at 0.5 to 3 m, calibration exact: RMS of position and orientation (3D), the
-   Cramer-Rao bound of the same noise, his unweighted fit of the same points, and what he states at 1 m; a single ball,
-   and the same by the direct linear transform (his eq. 3.4-3.5).
+a. a target of five balls, 98 mm, at 0.5 to 3 m, exact calibration: RMS of position and orientation (3D), the
+   Cramer-Rao bound of the same noise, his unweighted fit to the same points, and his stated figures at 1 m; a single
+   ball, and the same ball by the direct linear transform (his eq. 3.4-3.5).
 b. his tables 6.1 (a target moved by 400 mm, five times) and 6.2 (a still arm, the cameras moved around it over 2,000
-   frames), each over several calibrations of 13 boards.
+   frames), each over several calibrations with 13 boards.
 d. angles at 1 m, over calibrations, each with its own boards, measured targets and fitted chain: RMS, the share of
-   errors within 1.96 stated deviations, and the bound with exact calibration.
+   errors within 1.96 stated standard deviations, and the bound with exact calibration.
 e. joints from 2,000 frames, over the same calibrations: RMS of centre, axis and line, the share of errors within three
-   stated deviations; from 500 frames with a motion of +-3 degrees: RMS of the errors over their stated deviations.
+   stated standard deviations; from 500 frames with a motion of +-3 degrees: RMS of errors over stated deviations.
 
 Rendered images, through detection:
 
-c. rigs calibrated from rendered boards, a target in poses at 1 m: errors after one rigid alignment, which takes away
-   what a calibration displaces and turns as a whole.
+c. rigs calibrated with rendered boards, a target in poses at 1 m: errors after one rigid alignment, which removes the
+   displacement and rotation of the calibrated frame as a whole.
 """
 
 from __future__ import annotations
@@ -55,14 +56,14 @@ from body_tracking.simulation.target_points import TARGET_POINTS, rotation_error
 DISTANCES = (0.5, 0.6, 0.7, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0)
 FLOOR_BAR = 1.10
 RENDERED_BARS = 0.13, 0.11
-"""Millimetres and degrees after alignment."""
+"""Bars after alignment: millimetres and degrees."""
 ANGLE_BARS = {"shoulder": 0.17, "elbow": 0.125}
-"""Degrees: of the ball joint 3D, of the hinge."""
+"""Bars, degrees: of the ball joint 3D, of the hinge."""
 INSIDE_BAR = 92.0, 98.0
 JOINT_BARS = {"centre, mm": 0.15, "axis, deg": 0.05, "line, mm": 0.1}
 SMALL, SMALL_BAR = 3.0, 1.5
 STATED = {"position, mm": 0.25, "orientation, deg": 0.3, "ball joint, deg": 0.4, "hinge, deg": 0.3}
-"""What he expects at 1 m (section 6.1.2)."""
+"""Figures that he expects at 1 m (section 6.1.2)."""
 TABLE_6_1 = {
     "torso": (0.4990, 0.5155, 0.3720),
     "upper arm": (0.5271, 0.6155, 0.1340),
@@ -87,7 +88,7 @@ def rms3(values: FloatArray) -> float:
 
 
 def bound(rig: Rig, target: Target, rotation: FloatArray, translation: FloatArray) -> FloatArray:
-    """(6, 6) least covariance of a pose by the noise of the centroids (Cramer-Rao)."""
+    """(6, 6) Cramer-Rao bound of a pose's covariance by the noise of the centroids."""
     arms = target.points @ rotation.T
     by_pose = np.concatenate([np.broadcast_to(np.eye(3), (len(arms), 3, 3)), -so3.skew(arms)], axis=-1)
     information = np.zeros((6, 6))
@@ -140,7 +141,7 @@ def by_distance(count: int) -> dict[str, list[float]]:
 
 
 def lab_rng(part: int, number: int = 0) -> np.random.Generator:
-    """One for each part and calibration."""
+    """Random generator for a part and a calibration."""
     return np.random.default_rng([2011, part, number])
 
 
@@ -148,7 +149,7 @@ def lab_rng(part: int, number: int = 0) -> np.random.Generator:
 
 
 def displacements(number: int) -> FloatArray:
-    """Table 6.1 with one calibration: (3, 3, times) measured lengths of moves of 400 mm along x, y, z, less that."""
+    """Table 6.1 with one calibration: (3, 3, times) errors of measured moves of 400 mm along x, y, z, metres."""
     rng = lab_rng(2, number)
     room = lab.Lab.make(make_targets(), rng)
     result = np.empty((3, 3, TIMES))
@@ -188,7 +189,7 @@ def around(number: int, frames: int) -> dict[str, tuple[float, float]]:
     chain = chain_of(room, tree, lab.motion(rng, tree, frames // 4, 60.0), rng).chain
     still = lab.motion(rng, tree, 1, 0.0)
     rotations, translations = place(tree, still)
-    # the cameras' poses about the arm: all that is seen turns and moves as one
+    # poses of the cameras about the arm: all targets turn and move as one
     turns = Rotation.from_rotvec(rng.uniform(-0.8, 0.8, (frames, 3))).as_matrix()
     middle = translations[0].mean(axis=0)
     places = np.stack([lab.before(distance) for distance in rng.uniform(0.8, 1.3, frames)])
@@ -280,10 +281,10 @@ def chain_of(room: lab.Lab, tree: Tree, posture: Posture, rng: np.random.Generat
 
 
 def joint_errors(room: lab.Lab, tree: Tree, fit: ChainFit) -> dict[str, list[float]]:
-    """Of centre (ball joint), axis and line (hinge), in both targets: errors and their stated deviations.
+    """Errors of centre (ball joint), axis and line (hinge) in both targets, with their stated standard deviations.
 
-    Of each the length of the error in mm or degrees, the root of the stated variances summed, and over all numbers of
-    the joint whether each error is within three stated deviations.
+    Each error is a length in mm or degrees; its stated standard deviation is the root of the summed variances.
+    ``inside`` states for each coordinate whether its error is within three stated standard deviations.
     """
     chain = fit.chain
     covariance = chain.covariance + chain.sensitivity @ room.rig.covariance @ chain.sensitivity.T
@@ -341,7 +342,7 @@ def calibration(job: tuple[int, int, int]) -> dict[str, Any]:
 
 
 def floor_of_angles(truth: Rig, bodies: tuple[Target, ...], tree: Tree, posture: Posture) -> dict[str, FloatArray]:
-    """(n,) variance of each joint's angles by the noise of the centroids alone, everything else known (Cramer-Rao)."""
+    """(n,) Cramer-Rao bound of each joint's variance by the noise of the centroids alone, all else known; rad2."""
     rotations, translations = place(tree, posture)
     derivative = differentiate(tree, posture, rotations, False)
     bounds = np.array(
@@ -390,7 +391,7 @@ def pooled(results: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _displaced(jobs: list[int]) -> dict[str, dict[str, list[float]]]:
-    """Of each target along x, y, z: standard deviation of the moves, RMS against the true length, and his; mm."""
+    """Per target along x, y, z: standard deviation of the moves, RMS against the true length, and his figures; mm."""
     moves = 1e3 * np.stack([displacements(job) for job in jobs])  # (c, target, axis, times)
     spread, total = np.sqrt(moves.var(axis=3, ddof=1).mean(axis=0)), np.sqrt((moves**2).mean(axis=(0, 3)))
     return {

@@ -1,10 +1,10 @@
 """Centroids of rendered balls against their truth: RMS per axis in pixels, by category.
 
 A camera of 640x480 pixels, f 834 px, balls of 14 mm. ``sd`` is the root mean square of the stated standard deviation,
-``inside`` the share of errors within 1.96 of it, ``missed`` and ``extra`` are numbers of balls that were not found and
-of those that are none, ``ms`` is the median CPU time of an image. The categories pool distances of 0.6 to 2.5 m.
-Half overlap: one of two balls hides half of the other. The border cuts off 15 to 50 % of a ball's diameter. A limb
-hides half of a ball.
+``inside`` the share of errors within 1.96 of it, ``missed`` and ``extra`` are the numbers of balls that were not found
+and of detections without a ball, ``ms`` is the median CPU time of an image. The categories pool distances of 0.6 to
+2.5 m. Half overlap: one of two balls hides half of the other. The border cuts off 15 to 50 % of a ball's diameter. A
+limb hides half of a ball.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Row:
 
     @classmethod
     def of(cls, scenes: list[Rendered]) -> Row:
-        """Of some scenes."""
+        """Figures of these images."""
         wrong, stated, missed, extra = found(scenes)
         inside = 100.0 * float((np.abs(wrong) < 1.96 * stated).mean()) if len(wrong) else float("nan")
         spent = []
@@ -67,7 +67,7 @@ class Row:
 
 
 def by_category(count: int) -> dict[str, Row]:
-    """The categories; so many images of each distance, of balls apart a quarter of them, which show 15 balls each."""
+    """Rows of the categories with ``count`` images per distance; isolated balls, 15 an image, with a quarter of it."""
     return {
         name: Row.of(
             [make(seed, d) for d in DEPTHS for seed in range(max(count // 4, 1) if name == "isolated" else count)]

@@ -1,24 +1,23 @@
 """Joints of real marker clusters on skin: Qualisys trials of a knee and a hip, a Plug-in Gait trial of two elbows.
 
-Poses of clusters by an unweighted fit (Umeyama 1991) of the mean shape, whose markers have a noise of 1 mm.
+Poses of clusters by an unweighted fit (Umeyama 1991) of the mean shape; the noise of a marker is 1 mm.
 
-- ``knee``: the hinge between the thigh's and the shank's cluster, and how far its axis in the thigh and in the shank
-  turns between the first and the second half of the trial; the first bends it by 128 deg, the second by 86. The same by
-  the closed form (SARA), over frames of a bend that is in both halves, and, for what the method itself errs by, of
-  every other frame against the rest. ``floor``: RMS over that bend, in steps of
-  5 deg, of how far the shank is turned out of the hinge's plane in one half against the other. At one and the same bend
-  it is what no hinge explains, nor any joint of one degree of freedom: the knee turns about its long axis, and the
-  clusters move on the skin. No joint of one degree of freedom explains that, which shows the size of what is beyond a
-  hinge; it is no strict bound on the axis.
-- ``hip``: the ball joint between the pelvis' markers and the thigh's cluster. ``hip, wrong``: with the epicondyles as
-  part of the thigh's cluster, which is not rigid then.
+- ``knee``: the hinge between the clusters of thigh and shank, and the angle in the thigh and in the shank between its
+  axes in the first and the second half of the trial; the first bends the knee by 128 deg, the second by 86. Also by the
+  closed form (SARA), over frames of a bend that occurs in both halves, and, for the error of the method itself, of
+  every other frame against the rest. ``floor``: RMS over that common bend, in steps of 5 deg, of the difference between
+  the halves in the shank's rotation out of the hinge's plane. At the same bend no hinge explains it, nor any joint of
+  one degree of freedom: the knee turns about its long axis, and the clusters move on the skin. The floor shows the size
+  of these effects; it is no strict bound on the axis.
+- ``hip``: the ball joint between the markers of the pelvis and the thigh's cluster. ``hip, wrong``: with the
+  epicondyles as part of the thigh's cluster, which is then not rigid.
 - ``elbow``: a hinge between upper arm and forearm, which bend by 9 (left) and 15 deg (right).
-- ``gap``: RMS distance between both targets' centre, mm; ``turn``: RMS rotation that the joint cannot make, degrees;
-  ``scale``: errors in units of the markers' noise; ``motion``: RMS rotations about the principal axes, degrees.
-- biobuddy (SCoRE and SARA, Ehrig et al. 2006 and 2007) on the same poses, all of them, against our closed form and
-  against the maximum likelihood that starts from it: distance of the hip's centre and of the knee's axis (at the centre
-  of ours), mm, and the angle of the knee's axis, degrees. Left out where biobuddy is not installed (``pip install
-  biobuddy``; 0.3.2 was compared).
+- ``gap``: RMS distance between both targets' centres, mm; ``turn``: RMS rotation that the joint does not allow,
+  deg; ``scale``: errors in units of the markers' noise; ``motion``: RMS rotations about the principal axes, deg.
+- biobuddy (SCoRE and SARA, Ehrig et al. 2006 and 2007) on all of the same poses, against our closed form and against
+  the maximum likelihood that starts from it: distance of the hip's centre and of the knee's axis (at our centre), mm,
+  and the angle of the knee's axis, degrees. Left out where biobuddy is not installed (``pip install biobuddy``; 0.3.2
+  was compared).
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ from body_tracking.markers.observations import TargetPose
 from body_tracking.markers.pose_table import pose_table
 
 NOISE = 1e-3
-"""Metres, per axis of a marker."""
+"""Standard deviation of a marker per axis, metres."""
 STEP_DEG = 5.0
 HALVES_BAR_DEG, PEER_BAR_MM, PEER_BAR_DEG = 2.0, 0.5, 0.2
 THIGH, SHANK = ("RTHI1", "RTHI2", "RTHI3"), ("RLEG1", "RLEG2", "RLEG3")
@@ -49,7 +48,7 @@ PELVIS, EPICONDYLES = ("LPSIS", "RPSIS", "LASIS", "RASIS"), ("RLFE", "RMFE")
 
 @dataclass(frozen=True)
 class Peer:
-    """How far a joint of ours is from biobuddy's: in the parent target and in the child target."""
+    """Distance of our joint from biobuddy's, in the parent target and in the child target."""
 
     joint: str
     ours: str
@@ -60,7 +59,7 @@ class Peer:
 
 
 def markers(path: Path) -> dict[str, FloatArray]:
-    """(n, 3) metres of each marker of a C3D file."""
+    """(n, 3) positions of each marker of a C3D file, metres."""
     import ezc3d
 
     file = ezc3d.c3d(str(path))
@@ -69,7 +68,7 @@ def markers(path: Path) -> dict[str, FloatArray]:
 
 
 def cluster(trial: dict[str, FloatArray], names: tuple[str, ...]) -> list[TargetPose]:
-    """The poses of a target of these markers, whose shape is the mean one (Umeyama 1991, eq. 39-42)."""
+    """Poses of a target of these markers with their mean shape (Umeyama 1991, eq. 39-42)."""
     points = np.stack([trial[name] for name in names], axis=1)
     centre = points.mean(axis=1, keepdims=True)
     shape = points[0] - centre[0]
@@ -98,7 +97,7 @@ def cluster(trial: dict[str, FloatArray], names: tuple[str, ...]) -> list[Target
 
 
 def figures_of(fit: JointFit) -> dict[str, Any]:
-    """Figures of a fit; stated deviations are lengths."""
+    """Figures of a fit; stated deviations are the lengths of vectors of standard deviations."""
     deviations = np.sqrt(fit.joint.covariance.diagonal())
     return {
         "frames": fit.frames,
@@ -154,13 +153,13 @@ def halves_of(thigh: list[TargetPose], shank: list[TargetPose], whole: Joint) ->
 
 
 def axis_angle(first: FloatArray, second: FloatArray) -> float:
-    """Degrees between two axes, whatever their signs."""
+    """Angle between two axes of any sign, degrees."""
     angle = float(np.degrees(common.between(first, second)))
     return min(angle, 180.0 - angle)
 
 
 def peers(name: str, parent: list[TargetPose], child: list[TargetPose], fit: JointFit) -> list[Peer]:
-    """The same joint by biobuddy; none where it is not installed."""
+    """The same joint by biobuddy; empty where it is not installed."""
     try:
         from biobuddy.model_modifiers.joint_center_tool import Sara, Score
         from biobuddy.utils.linear_algebra import RotoTransMatrixTimeSeries

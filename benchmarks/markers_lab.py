@@ -1,7 +1,7 @@
-"""A simulated marker laboratory: a rig that is calibrated, targets that are measured, an arm that moves before them.
+"""A simulated marker laboratory: a rig to calibrate, targets to measure, an arm that moves in front of them.
 
 Shared by the benchmarks of accuracy. Balls have the centroid noise of the thesis (0.1 pixels, Gaschler 2011, 6.1) and
-corners of boards the residual of its table 4.1 (0.06), without images; every step behind is the package's own.
+corners of boards the residual of its table 4.1 (0.06), without images; all later steps are the package's own.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from body_tracking.markers.triangulation import triangulate
 from body_tracking.simulation.marker_scene import APART, TOED_IN, stereo_rig
 
 BALL_NOISE, CORNER_NOISE = 0.1, 0.06
-"""Pixels."""
+"""Standard deviations per axis, pixels."""
 VIEWS, TARGET_VIEWS = 13, 60
 PERIOD_NS = 16_666_667
 
 
 def before(distance: float) -> FloatArray:
-    """(3,) the place so far from the left camera that is in the middle of both views, metres."""
+    """(3,) point at this distance from the left camera, in the middle of both views, metres."""
     return np.array([0.5 * (APART - distance * np.tan(TOED_IN)), 0.0, distance])
 
 
 def corners(truth: Rig, rng: np.random.Generator) -> Corners:
-    """Corners of a board of 9 x 6, squares of 40 mm, in 13 poses in which both cameras see all of it."""
+    """Corners of a board of 9 x 6, squares of 40 mm, in 13 poses; both cameras see all of it."""
     board = np.stack([*np.meshgrid(0.04 * np.arange(9), 0.04 * np.arange(6)), np.zeros((6, 9))], axis=-1).reshape(-1, 3)
     seen: list[FloatArray] = []
     while len(seen) < VIEWS:
@@ -57,7 +57,7 @@ def corners(truth: Rig, rng: np.random.Generator) -> Corners:
 
 
 def calibrated(truth: Rig, rng: np.random.Generator) -> Rig:
-    """The rig as 13 boards make it known."""
+    """The rig as calibrated with 13 boards."""
     sizes = [(camera.width, camera.height) for camera in truth.cameras]
     return calibrate_cameras([camera.frame_id for camera in truth.cameras], sizes, corners(truth, rng)).rig
 
@@ -74,7 +74,7 @@ def see(truth: Rig, balls: FloatArray, rng: np.random.Generator, stamp_ns: int =
 
 
 def points_of(rig: Rig, images: Sequence[ImageBalls]) -> Points:
-    """The points of the balls, in their order; where epipolar lines cross several balls, the right ones."""
+    """Triangulated points in the order of the balls, without wrong matches where epipolar lines cross several balls."""
     points = triangulate(rig, images)
     right = np.flatnonzero((points.balls == points.balls[:, :1]).all(axis=1))
     right = right[np.argsort(points.balls[right, 0])]
@@ -87,7 +87,7 @@ def points_of(rig: Rig, images: Sequence[ImageBalls]) -> Points:
 
 
 def poses_of(targets: Sequence[Target], points: Points) -> list[TargetPose]:
-    """The poses of targets whose balls follow each other; a ball that the gates of matching lost is not seen."""
+    """Poses of targets with consecutive balls; balls lost by the gates of matching count as not seen."""
     row = np.full(sum(len(target.points) for target in targets), -1)
     row[points.balls[:, 0]] = np.arange(len(points.balls))
     poses, start = [], 0
@@ -110,10 +110,10 @@ class Lab:
     """A laboratory after its calibration.
 
     Attributes:
-        truth: the rig as it is.
+        truth: the true rig.
         rig: as calibrated.
-        bodies: the targets as they are.
-        targets: as measured, in frames of their own.
+        bodies: the true targets.
+        targets: as measured, in their own frames.
         turns: (t, 3, 3) and
         shifts: (t, 3) metres: a point x of a true target is at ``turn @ x + shift`` in the measured one.
     """
@@ -127,7 +127,7 @@ class Lab:
 
     @classmethod
     def make(cls, bodies: Sequence[Target], rng: np.random.Generator) -> Lab:
-        """Calibrate the rig by boards, and measure each target from 60 views at a metre."""
+        """Calibrate the rig with boards, and measure each target from 60 views at a metre."""
         truth = stereo_rig()
         rig, targets = calibrated(truth, rng), []
         turns, shifts = np.empty((len(bodies), 3, 3)), np.empty((len(bodies), 3))
@@ -147,7 +147,7 @@ class Lab:
     def measure(
         self, rotations: FloatArray, translations: FloatArray, rng: np.random.Generator
     ) -> list[list[TargetPose]]:
-        """Poses of all targets, frame by frame, whose true ones are (n, t, 3, 3), (n, t, 3)."""
+        """Measured poses of all targets, frame by frame; the true poses are (n, t, 3, 3), (n, t, 3)."""
         return [
             poses_of(self.targets, points_of(self.rig, see(self.truth, placed(self.bodies, turn, shift), rng, stamp)))
             for stamp, turn, shift in zip(
@@ -177,7 +177,7 @@ class Lab:
 
 
 def arm(rng: np.random.Generator, names: Sequence[str]) -> Tree:
-    """A ball joint between the first two targets and a hinge between the last two, some 0.12 m from all of them."""
+    """A ball joint between the first two targets and a hinge between the last two, about 0.12 m from all of them."""
 
     def centre() -> FloatArray:
         direction = rng.normal(size=3)
@@ -195,7 +195,7 @@ def arm(rng: np.random.Generator, names: Sequence[str]) -> Tree:
 
 
 def motion(rng: np.random.Generator, tree: Tree, frames: int, degrees: float) -> Posture:
-    """The arm at a metre: joints that fill +- so many degrees about all their axes, a body that sways by 30."""
+    """Arm at a metre; joints move within +-``degrees`` about all their axes, the body sways by 30 degrees."""
 
     def smooth(width: int, size: float) -> FloatArray:
         times = np.linspace(0.0, 1.0, frames)[:, None]

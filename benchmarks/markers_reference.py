@@ -1,23 +1,23 @@
-"""A Kinect judged by the marker system, beside the truth: simulated people, and a real pendulum.
+"""A Kinect evaluated by the marker system, beside the truth: simulated people, and a real pendulum.
 
-``people``: a simulated person before one Kinect wears targets on thorax, clavicle, upper arm and forearm, each pose
-with 0.15 degrees of noise. The clock of the marker system is 1.7 s and 50 ppm off, rig and mountings are random.
-Replayed with each filter, the estimate is judged as ``body_tracking evaluate EST --truth MARKERS`` does.
+``people``: a simulated person in front of one Kinect wears targets on thorax, clavicle, upper arm and forearm; the
+poses have a noise of 0.15 degrees. The clock of the marker system is off by 1.7 s and 50 ppm; rig and mountings are
+random. The recording is replayed with each filter and evaluated as by ``body_tracking evaluate EST --truth MARKERS``.
 
-- ``by markers``: RMS error of an angle that the reference gives, with its interval.
+- ``by markers``: RMS error of an angle by the reference, with its interval.
 - ``true``: RMS of the same angle's true error without its mean.
-- ``not absorbed``: RMS of what no constant rotation of each segment and of the rig and no clock explain of its true
-  error, by the same fit to the exact orientations of the whole recording: what markers can show of it.
-- ``inside``: share of angles whose error lies in the interval, of those for which the reference is not too poor; of
-  ``not absorbed``, and of ``true``.
-- ``refused``: recordings without a result, as too little of their movement is in the estimate.
-- ``clock``: error of the offset, which has the filter's delay in it, in ms, beside its stated deviation.
+- ``not absorbed``: RMS of the true error left by constant rotations of each segment and of the rig and by the clock,
+  after the same fit to the exact orientations of the whole recording: the part of the error that markers can show.
+- ``inside``: share of angles whose error lies in the interval, among those for which the reference is good enough; for
+  ``not absorbed``, and for ``true``.
+- ``refused``: recordings without a result, because the estimate contains too little movement.
+- ``clock``: error of the offset, which includes the filter's delay, in ms, beside its stated standard deviation.
 
-``pendulum``: orientations of a real pendulum's links from raw inertial data (RepoIMU), judged by Vicon as if its
-clusters were targets. Every link turns about one axis only, so that the fit has to refuse (``refused``). With the
-mounting of the other half, of which one free rotation about that axis is chosen as it comes, world and clock are fitted
-there and the difference is taken here. ``imu_pendulum`` fits mounting and world to the whole recording: ``1 offset``
-there is the figure to compare with; its smaller ones follow Vicon's wandering clock, which this cannot.
+``pendulum``: orientations of a real pendulum's links from raw inertial data (RepoIMU), evaluated by Vicon as if its
+clusters were targets. Every link turns about one axis only, so that the fit has to be refused (``refused``). With the
+mounting from one half, in which the free rotation about that axis is arbitrary, world and clock are fitted to that half
+and the difference is computed on the other. ``imu_pendulum`` fits mounting and world to the whole recording: compare
+with ``1 offset`` there; its smaller figures follow Vicon's wandering clock, which this fit cannot.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ SECONDS = 40.0
 MOTIONS = ("reaching", "arm_raises", "punching")
 FILTERS = ("lkf_constant_velocity", "ekf")
 FIRST_SEED = 700
-"""Other people than those of the tests."""
+"""Other people than in the tests."""
 SHOWN = ("shoulder_abduction_left", "elbow_flexion_left", "forearm_pronation_left")
 
 
@@ -67,7 +67,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Angle:
-    """Degrees."""
+    """Figures of one angle, degrees."""
 
     name: str
     true: float
@@ -79,7 +79,7 @@ class Angle:
 
 @dataclass(frozen=True)
 class Case:
-    """Result of a job; milliseconds."""
+    """Result of a job; clock figures in milliseconds."""
 
     job: Job
     clock_error: float
@@ -88,7 +88,7 @@ class Case:
 
 
 def judge(job: Job) -> Case | None:
-    """Simulate, replay, judge; None where it is refused."""
+    """Simulate, replay, evaluate; None if refused."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         recording = simulate(Setup(job.motion, seconds=SECONDS, seed=FIRST_SEED + job.seed))
@@ -115,18 +115,18 @@ def judge(job: Job) -> Case | None:
 
 
 def _clock(result: ReferenceEvaluation, zero_ns: int) -> tuple[float, float]:
-    """Error of the clock's offset at the middle, and its deviation, ms."""
+    """Error of the clock's offset at the middle, and its standard deviation, ms."""
     elapsed = result.fit.middle + (int(result.estimate.stamps_ns[0]) - zero_ns) / NANOSECONDS
     return 1e3 * (result.offset_s - OFFSET - DRIFT * elapsed), 1e3 * result.clock_stddev
 
 
 def _angles(result: ReferenceEvaluation, true: dict[str, Track], elapsed: float) -> list[Angle]:
-    """What the markers give and what is true at the same instants, of equivalent triples of angles the nearest one.
+    """Angles by the markers beside the true ones at the same instants; of equivalent triples the nearest is taken.
 
     Args:
         result: by the markers.
-        true: orientations of the segments, in s since the truth begins.
-        elapsed: s from then until the estimate begins.
+        true: orientations of the segments by seconds since the truth begins.
+        elapsed: seconds from the start of the truth to that of the estimate.
     """
     found = []
     mounted = _mounted(result, true, elapsed)
@@ -166,7 +166,7 @@ def _mounted(result: ReferenceEvaluation, true: dict[str, Track], elapsed: float
 
 @dataclass(frozen=True)
 class Pendulum:
-    """A link: degrees, milliseconds."""
+    """Figures of a link, degrees and milliseconds."""
 
     link: int
     refused: bool
@@ -177,7 +177,7 @@ class Pendulum:
 
 
 def pendulum(folder: Path) -> list[Pendulum]:
-    """Each link alone: Vicon's cluster is the target, the inertial sensor the segment."""
+    """Each link alone: Vicon's cluster is the target, the inertial sensor is the segment."""
     names = [f"Pendulum_Test02a_Trial1_Segment_{link}.csv.gz" for link in LINKS]
     return [judge_link(*each) for each in zip(LINKS, common.recordings(folder, names), strict=True)]
 
@@ -229,7 +229,7 @@ def _rms(vectors: FloatArray) -> float:
 
 
 def row_of(case: Case) -> dict[str, object]:
-    """Degrees and milliseconds; of some angles the error by markers, its interval, not absorbed and true errors."""
+    """Degrees and milliseconds; for some angles [error by markers, bounds of its interval, not absorbed, true]."""
     shown = {
         angle.name: [angle.error, angle.low, angle.high, angle.not_absorbed, angle.true]
         for angle in case.angles

@@ -1,15 +1,15 @@
 """Time from a pair of images to joint angles: computation alone, and through the live nodes.
 
-Two scenes of three targets before two cameras of 640x480, with the usual noise: targets a metre away that swing, whose
-balls stay apart in the images; and the arm of the shipped recording, 1.7 m away, whose balls often touch.
+Two scenes of three targets in front of two cameras of 640x480, with the usual noise: targets that swing a metre away,
+whose balls stay apart in the images; and the arm of the shipped recording, 1.7 m away, whose balls often touch.
 
 - computation: of each pair, tracked and from scratch, without messages: median and 99 %, ms of this machine, and as
   multiples of the reference: ``cv2.GaussianBlur`` of the same two images (sigma 2), pair by pair in the same run.
-  ``cpu`` is processor time, which other work on the machine changes less.
+  ``cpu`` is processor time; other work on the machine changes it less.
 - live: reliable images at 60 Hz through the graph's nodes, from just before the left image is published until the
-  angles are received, by one clock; pairs without angles. ``--no-live`` leaves it out.
+  angles are received, by one clock; number of pairs without angles. ``--no-live`` leaves this part out.
 
-The exit code is 1 where a bar is missed.
+The exit code is 1 if a bar is missed.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ STEPS = ("detection", "triangulation", "tracking", "angles", "afterwards")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """Images of a scene: (topic, pixels) of both cameras, frame by frame; its setup."""
+    """Images of a scene, a pair per frame; frame ids of the two cameras; folder of its setup."""
 
     images: Sequence[tuple[NDArray[Any], NDArray[Any]]]
     frames: tuple[str, str]
@@ -70,7 +70,7 @@ class Pairs:
 
 
 def apart(rng: np.random.Generator) -> MarkerScene:
-    """Three targets side by side at a metre, turned so that their balls are apart, that swing by some degrees."""
+    """Three targets side by side at a metre, turned so that their balls are apart; they swing by 6 degrees."""
     rig, bodies = stereo_rig(), make_targets()
     places = lab.before(1.0) + np.array([[-0.2, 0.0, 0.0], [0.0, 0.0, 0.0], [0.2, 0.0, 0.0]])
     rest = np.stack([widest(rig.project, body.points, place, rng) for body, place in zip(bodies, places, strict=True)])
@@ -97,7 +97,7 @@ def apart(rng: np.random.Generator) -> MarkerScene:
 
 
 def widest(project: Any, points: FloatArray, where: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """The rotation of 500 random ones with the widest gaps between the balls in both images."""
+    """The rotation with the widest gaps between the balls in both images, of 500 random ones."""
 
     def gap(rotation: FloatArray) -> float:
         pixels = project(points @ rotation.T + where)
@@ -108,13 +108,13 @@ def widest(project: Any, points: FloatArray, where: FloatArray, rng: np.random.G
 
 
 def chain_of(joints: Sequence[Joint]) -> Chain:
-    """Joints known to 0.03 mm and 0.02 degrees; not by the calibration's parameters, which takes as long."""
+    """Joints with 0.03 mm and about 0.002 degrees; zero sensitivities to the calibration, which take as long."""
     size = SIZE * len(joints)
     return Chain(tuple(joints), 1e-9 * np.eye(size), np.zeros((size, 30)))
 
 
 def prepared(scene: MarkerScene, folder: Path, seed: int) -> Pairs:
-    """Render a scene, and write its setup with a rig as boards make it known."""
+    """Render a scene, and write its setup with a rig as calibrated with boards."""
     save_rig(lab.calibrated(scene.rig, np.random.default_rng(seed)), folder / setup.RIG)
     save_targets(scene.targets, folder / setup.TARGETS)
     save_chain(chain_of(scene.chain.joints), folder / setup.CHAIN)
@@ -137,10 +137,10 @@ def stages(folder: Path) -> list[Stage]:
 
 
 def through(chain: Sequence[Stage], pairs: Pairs, index: int, stamp_ns: int) -> tuple[FloatArray, bool]:
-    """(5, 2) seconds of wall and processor time for a pair, and whether angles came of it.
+    """(5, 2) seconds of wall and processor time for a pair, and whether it gave angles.
 
-    Until each stage's last output; the last row is what stages do after it (the rig is watched), for which no other
-    stage waits.
+    Each row ends at the stage's last output; the last row is the work of the triangulation after it (it watches the
+    rig), for which no other stage waits.
     """
     payloads: list[tuple[str, Any]] = [
         (setup.image_topic(frame), (stamp_ns, frame, image))
@@ -166,15 +166,15 @@ def through(chain: Sequence[Stage], pairs: Pairs, index: int, stamp_ns: int) -> 
 
 
 def clocks() -> FloatArray:
-    """(2,) seconds of wall and processor time; a call may take 0.2 ms itself in a virtual machine."""
+    """(2,) seconds of wall and processor time; in a virtual machine a call may itself take 0.2 ms."""
     return np.array([time.perf_counter(), time.thread_time()])
 
 
 def computation(pairs: Pairs) -> dict[str, Any]:
-    """Times of all pairs, tracked (twice through the recording, there and back) and from scratch, and the reference."""
+    """Times of all pairs, tracked (to and fro through the recording) and from scratch, and of the reference."""
     chain, period = stages(pairs.folder), round(NANOSECONDS / RATE)
     count = len(pairs.images)
-    for index in range(5):  # compiled, and read into memory
+    for index in range(5):  # for compilation and loading
         through(chain, pairs, index, index * period)
     tracked, scratch, reference, came = [], [], [], 0
     order = [*range(5, count), *range(count - 1, -1, -1)]
@@ -210,7 +210,7 @@ def computation(pairs: Pairs) -> dict[str, Any]:
 
 
 def measured_live(pairs: Pairs, seconds: float, warm_up: float) -> dict[str, Any]:
-    """Delays from the publication of the left image to the angles."""
+    """Delays from publishing the left image to receipt of the angles."""
     topics = [setup.image_topic(frame) for frame in pairs.frames]
     messages = [
         [
@@ -261,7 +261,7 @@ def measured_live(pairs: Pairs, seconds: float, warm_up: float) -> dict[str, Any
 
 
 def show(figures: Mapping[str, Any]) -> None:
-    """The tables."""
+    """Print the tables."""
     for name, found in figures.items():
         row = found["computation"]
         print(f"{name}: reference {row['reference']:.2f} ms wall, {row['cpu reference']:.2f} cpu")

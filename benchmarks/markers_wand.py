@@ -1,10 +1,11 @@
 """Cameras around a room, calibrated alone by boards and placed by a waved wand.
 
-Cameras as Gaschler's (834 pixels of focal length, 640x480) stand on a circle of 2 m, look at its middle, and are each
-calibrated by 13 boards of their own (noise of 0.06 pixels). A wand of 0.45 m with three balls (noise of 0.1 pixels, one
-sighting in a hundred wrong) is waved in the middle. The poses to the first camera are compared with the true ones:
-RMS of turn and translation (3D), the share of errors within 1.96 stated deviations, and the RMS of errors over stated
-deviations; with the lenses' covariance as a prior, as ``markers wand`` has it, and with the lenses held as they are.
+Cameras like Gaschler's (834 pixels of focal length, 640x480) stand on a circle of 2 m, look at its centre, and are each
+calibrated with 13 boards of their own (noise of 0.06 pixels). A wand of 0.45 m with three balls (noise of 0.1 pixels,
+one sighting in a hundred wrong) is waved in the middle. The poses relative to the first camera are compared with the
+true ones: RMS of turn and translation (3D), the share of errors within 1.96 stated standard deviations, and the RMS of
+errors over stated standard deviations; with the lenses' covariance as a prior, as in ``markers wand``, and with fixed
+lenses.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ ROOMS = (2, 4, 8)
 PLACES = (60, 240)
 WAND = Wand((0.0, 0.15, 0.45))
 RADIUS, BETWEEN = 2.0, np.radians(35.0)
-"""Metres from the cameras to the middle, and the angle between neighbours, seen from there."""
+"""Distance of the cameras from the middle, metres, and angle between neighbours seen from there, radians."""
 BOARDS, CORNER_NOISE, BALL_NOISE, WRONG = 13, 0.06, 0.1, 0.01
 INSIDE_BAR, RATIO_BAR = (88.0, 99.5), 1.4
 
@@ -47,7 +48,7 @@ def room(count: int) -> Rig:
 
 
 def lens_of(camera: Camera, rng: np.random.Generator) -> Rig:
-    """The camera as boards of its own make it known."""
+    """The camera as calibrated with its own boards."""
     board = np.stack([*np.meshgrid(0.04 * np.arange(9), 0.04 * np.arange(6)), np.zeros((6, 9))], axis=-1).reshape(-1, 3)
     seen: list[FloatArray] = []
     while len(seen) < BOARDS:
@@ -62,7 +63,7 @@ def lens_of(camera: Camera, rng: np.random.Generator) -> Rig:
 
 
 def waved(truth: Rig, places: int, rng: np.random.Generator) -> Sightings:
-    """The wand's balls in the cameras that see all of them."""
+    """Sightings of the wand's balls in the cameras that see all of them."""
     middle = np.array([0.0, 0.0, RADIUS]) + rng.uniform(-0.5, 0.5, (places, 3))
     along = rng.normal(size=(places, 3))
     along /= np.linalg.norm(along, axis=1, keepdims=True)
@@ -78,7 +79,7 @@ def waved(truth: Rig, places: int, rng: np.random.Generator) -> Sightings:
 
 
 def errors(truth: Rig, found: Rig) -> tuple[FloatArray, FloatArray]:
-    """(n - 1, 6) errors of turn and translation, radians and metres, and the stated deviations."""
+    """(n - 1, 6) errors of turn and translation, radians and metres, and the stated standard deviations."""
     turn = so3.rotation_vectors(truth.rotations @ found.rotations.transpose(0, 2, 1))
     wrong = np.concatenate([turn, truth.translations - found.translations], axis=1)
     stated = np.sqrt(np.diag(found.covariance))
@@ -87,7 +88,7 @@ def errors(truth: Rig, found: Rig) -> tuple[FloatArray, FloatArray]:
 
 
 def calibration(job: tuple[int, int, int]) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Errors and deviations in a room (number of cameras, of places, of the draw), by a prior and by held lenses."""
+    """Errors and deviations in a room (numbers of cameras, places and draw), with a prior and with fixed lenses."""
     count, places, number = job
     rng = np.random.default_rng([number, count, places, 34])
     truth = room(count)

@@ -1,10 +1,10 @@
 """The published method of Jatesiktat et al. (2018) beside ours, in one run: errors and time.
 
-Simulated images of clothed people with an inertial sensor on each forearm. Both have the same body, whose shape was
-estimated by ``mesh_tracker`` before, and the same sensors. Theirs (``body_tracking.mesh.jatesiktat``) also has what it
-needs: the true silhouette, and the skeleton of the simulated Kinect as a start. Errors of shoulders, elbows and wrists,
-millimetres, as they are and without the constant offset of each joint; the time is that of the processor per image.
-``jatesiktat, mean of 3`` is with the moving average, which costs an image of delay.
+Simulated images of clothed people with an inertial sensor on each forearm. Both methods have the same body, whose shape
+``mesh_tracker`` estimated before, and the same sensors. Theirs (``body_tracking.mesh.jatesiktat``) also gets its
+required inputs: the true silhouette, and the skeleton of the simulated Kinect as a start. Errors of shoulders, elbows
+and wrists, millimetres, with and without the constant offset of each joint; the time is processor time per image.
+``jatesiktat, mean of 3`` has the moving average, at a delay of one image.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from body_tracking.simulation.depth_scene import SENSOR
 MOTIONS = ("reaching", "two_handed_wave")
 SOURCES = ("ours", "jatesiktat", "jatesiktat, mean of 3", "kinect")
 _BEGIN = 3.0
-"""Seconds of the motion after which the methods are compared: ours has seen several poses by then."""
+"""Seconds of the motion before the comparison: ours has seen several poses by then."""
 
 
 class Job(NamedTuple):
@@ -45,7 +45,7 @@ class Job(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Run:
-    """Errors (n, 6, 3) metres by source, and milliseconds (n,) of ours and of theirs."""
+    """Errors (n, 6, 3) by source, metres, and processor times (n,) of ours and of theirs, milliseconds."""
 
     errors: dict[str, FloatArray]
     ms: dict[str, FloatArray]

@@ -1,11 +1,11 @@
-"""The mesh fitted to simulated depth images of clothed people whom nothing was made from, in ordinary motions.
+"""The mesh fitted to simulated depth images of held-out people in clothes, in ordinary motions.
 
 Shoulders, elbows and wrists of ``mesh_tracker`` beside those of the simulated Kinect's skeleton, millimetres: the mean
-and the 95th percentile, as they are and without the constant offset of each joint. ``floor`` is the same fit of every
-tenth image started at the true joints. ``NEES`` is the mean squared error over the stated variance, per degree of
-freedom, ``in 1.96 sd`` the share of coordinates within 1.96 stated deviations. ``bone correlation``: of the
-errors of the joints at the two ends of a bone. The time is that of the processor per image of 512x424 pixels, after the
-first, which searches for the person.
+and the 95th percentile, with and without the constant offset of each joint. ``floor`` is the fit of every tenth image,
+started at the true joints. ``NEES`` is the mean squared error over the stated variance, per degree of freedom,
+``in 1.96 sd`` the share of coordinates within 1.96 stated standard deviations. ``bone correlation`` is that of the
+errors of the joints at the two ends of a bone. The time is processor time per image of 512x424 pixels, without the
+first one, in which the person is searched for.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ class Job(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Run:
-    """Errors (n, 6, 3) in metres of shoulders, elbows and wrists, of the images in which the person was tracked.
+    """Errors (n, 6, 3) of shoulders, elbows and wrists in the images with a tracked person, metres.
 
     Attributes:
-        job: what was run.
-        images: how many there were.
-        mesh, kinect, floor: errors; of the Kinect's skeleton in the same images.
-        covariance: (n, 6, 3, 3) stated of ``mesh``.
-        ms: (images - 1,) milliseconds of the processor.
+        job: motion, person and duration.
+        images: number of images.
+        mesh, kinect, floor: errors; the Kinect's are of the same images, the floor's of every tenth.
+        covariance: (n, 6, 3, 3) stated of ``mesh``, m2.
+        ms: (images - 1,) processor time, milliseconds.
     """
 
     job: Job
@@ -99,7 +99,7 @@ def run(job: Job) -> Run:
 
 
 def _mm(errors: Sequence[FloatArray], *, offset: bool) -> FloatArray:
-    """Distances in millimetres of all runs, without each run's mean error of each joint unless ``offset``."""
+    """Lengths of all runs' errors, millimetres; without each run's mean error of each joint unless ``offset``."""
     moved = [each if offset else each - np.nanmean(each, axis=0) for each in errors if len(each)]
     distances = np.concatenate([1e3 * np.linalg.norm(each, axis=2).ravel() for each in moved])
     return distances[np.isfinite(distances)]

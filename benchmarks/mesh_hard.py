@@ -1,20 +1,19 @@
-"""The mesh in hard cases: fast motion, people who walk in, and what a Kinect's skeleton hides.
+"""The mesh in hard cases: fast motion, people who walk in, and motions that a Kinect's skeleton hides.
 
-``fast``: motions three times as fast; ``punching`` has no bar, its hands exceed 7 m/s. Errors of shoulders, elbows
-and wrists, millimetres; ``floor`` is the same fit of every tenth image started at the true joints. An image is lost
-where there is no skeleton, or the mean error of these joints is more than 100 mm; it is flagged where there is no
-skeleton, or where each joint that is more than 150 mm off is inferred. ``longest`` is the longest time without an
-image that is not lost.
+``fast``: motions at three times the speed; ``punching`` has no bar, its hands exceed 7 m/s. Errors of shoulders, elbows
+and wrists, millimetres; ``floor`` is the fit of every tenth image, started at the true joints. An image is lost if it
+has no skeleton, or if the mean error of these joints exceeds 100 mm. It is flagged if it has no skeleton, or if every
+joint with an error of more than 150 mm is inferred. ``longest`` is the duration of the longest run of lost images.
 
 ``walk in``: people walk in from a side, with the arms in any posture, and turn to the camera. ``within`` is the share
-of those who are tracked, with a mean error of these joints of less than 100 mm, within a second after all of them are
-in the image.
+of people who are tracked, with a mean error of these joints below 100 mm, within a second after all these joints, head
+and base of the spine are in the image.
 
-``bend``, ``shrug``: the trunk bent to both sides, and both shoulders lifted in turns, by the mesh's skeleton, by that
-of the simulated Kinect, and by the angles of the filter ``ekf`` behind each. Root mean square errors after 3 s,
-without the constant part: of the bend between lower and upper trunk by SpineBase, SpineMid and SpineShoulder,
-degrees; of a shoulder's height over SpineShoulder along the trunk, millimetres; of the filter's angles, degrees.
-``floor`` is the fit of every tenth image started at the true joints.
+``bend``, ``shrug``: the trunk bends to both sides, or both shoulders are lifted repeatedly; by the mesh's skeleton, by
+that of the simulated Kinect, and by the angles of the filter ``ekf`` behind each. RMS errors after 3 s, without the
+constant part: of the bend between lower and upper trunk by SpineBase, SpineMid and SpineShoulder, degrees; of a
+shoulder's height over SpineShoulder along the trunk, millimetres; of the filter's angles, degrees. ``floor`` is the fit
+of every tenth image, started at the true joints.
 """
 
 from __future__ import annotations
@@ -59,20 +58,21 @@ FAST = ("reaching", "two_handed_wave", "torso_twist", "arm_raises")
 _PUNCHING = "punching"
 SPEED = 3.0
 LOST, WRONG = 0.1, 0.15
-"""Metres: mean error of the arms' joints in a lost image, and of a joint that has to be flagged there."""
+"""Metres: mean error of the arms' joints above which an image is lost, and error above which a joint must be
+inferred."""
 WITHIN = 1.0
-"""Seconds."""
+"""Seconds in which people who walk in must be tracked."""
 _FLOOR = 10
 _PEOPLE = 12
-"""Different people among the starts."""
+"""Number of different people among the starts."""
 _SETTLED = 3.0
-"""Seconds after which bends and shrugs are compared: the filter has learned the joints' centres from the T-pose."""
+"""Seconds before the comparison of bends and shrugs: the filter has learned the joints' centres from the T-pose."""
 _LATERAL = [MODEL.coordinate_names.index(f"{part}_lateral") for part in ("lumbar", "thoracic")]
 _ELEVATION = [MODEL.coordinate_names.index(f"clavicle_elevation_{side}") for side in ("left", "right")]
 
 
 class Job(NamedTuple):
-    """One person in one case; of ``walk in`` one start."""
+    """One person in one case; for ``walk in`` one start."""
 
     case: str
     motion: str
@@ -84,11 +84,11 @@ class Job(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FastRun:
-    """Images of one person, in order.
+    """Errors of one person's images, in order.
 
     Attributes:
-        errors: (n, 6) metres of the arms' joints; NaN without a skeleton.
-        inferred: (n, 6) joints that are stated as such.
+        errors: (n, 6) of the arms' joints, metres; NaN without a skeleton.
+        inferred: (n, 6) whether the joint is stated to be inferred.
         floor: (m, 6) metres.
         kinect: (n, 6) metres.
     """
@@ -100,19 +100,19 @@ class FastRun:
 
     @property
     def lost(self) -> BoolArray:
-        """(n,)"""
+        """(n,) whether the image is lost."""
         return ~(self.errors.mean(axis=1) < LOST)
 
     @property
     def unflagged(self) -> int:
-        """Lost images that are not flagged."""
+        """Number of lost images with a skeleton that are not flagged."""
         wrong = self.errors > WRONG
         flagged = wrong.any(axis=1) & (~wrong | self.inferred).all(axis=1)
         return int((self.lost & np.isfinite(self.errors[:, 0]) & ~flagged).sum())
 
     @property
     def longest(self) -> float:
-        """Seconds of the longest run of lost images."""
+        """Duration of the longest run of lost images, seconds."""
         most = now = 0
         for lost in self.lost:
             now = now + 1 if lost else 0
@@ -140,7 +140,7 @@ def run_fast(job: Job) -> FastRun:
 
 
 def _off(skeleton: Skeleton | None, joints: FloatArray) -> FloatArray:
-    """(6,) metres, NaN without a skeleton."""
+    """(6,) errors of the arms' joints, metres; NaN without a skeleton."""
     if skeleton is None:
         return np.full(len(ARMS), np.nan)
     return np.asarray(np.linalg.norm((skeleton.positions - joints)[ARMS], axis=1))
@@ -161,11 +161,11 @@ def fast_figures(runs: Sequence[FastRun]) -> dict[str, float]:
     }
 
 
-# --- other motions than those of the repertoire
+# --- motions beside the repertoire
 
 
 def composed(scene: DepthScene, postures: FloatArray, times: FloatArray, walk: Walk | None = None) -> Course:
-    """Postures (n, 35) on the spot, or on a walk, at (n,) seconds, in the person's own frame."""
+    """Course of postures (n, 35) at (n,) seconds in the person's own frame, on the spot or on a walk."""
     person, turned = scene.who.person, postures.copy()
     if walk is None:
         feet, places = standing(person, postures), np.zeros((len(times), 2))
@@ -185,9 +185,9 @@ class Walk:
     """A straight walk to a place, and a turn there.
 
     Attributes:
-        start, end_at: (2,) metres, in the person's frame at the end: x to the camera, y to the left.
-        speed: metres a second.
-        step_s: seconds a step.
+        start, end_at: (2,) metres in the person's frame at the end: x to the camera, y to the left.
+        speed: m/s.
+        step_s: duration of a step, seconds.
     """
 
     start: FloatArray
@@ -197,16 +197,16 @@ class Walk:
 
     @property
     def arrival(self) -> float:
-        """Seconds."""
+        """Time of arrival, seconds."""
         return float(np.linalg.norm(self.end_at - self.start)) / self.speed
 
     @property
     def end(self) -> float:
-        """Seconds until the person has turned to the camera."""
+        """Time at which the person has turned to the camera, seconds."""
         return self.arrival + 0.8
 
     def __call__(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Places (n, 2) and headings (n,), radians."""
+        """Places (n, 2), metres, and headings (n,), radians."""
         way = self.end_at - self.start
         share = np.clip(times / self.arrival, 0.0, 1.0)
         heading = float(np.arctan2(way[1], way[0]))
@@ -256,7 +256,7 @@ _MOVES = {"bend": posture(trunk_lateral=28.0, pelvis_lateral=3.0), "shrug": post
 
 
 def _any_arms(rng: np.random.Generator) -> FloatArray:
-    """(35,) added to hanging arms: as they are for a third of the people, else anywhere in front or beside."""
+    """(35,) added to hanging arms: zero for a third of the people, else random arms in front or beside."""
     if rng.random() < 1.0 / 3.0:
         return posture()
     return sum(
@@ -283,9 +283,9 @@ class WalkRun:
     """One start.
 
     Attributes:
-        seconds: from the first image with all joints inside to the first with a true skeleton; infinite for none
+        seconds: from the first image with all joints inside to the first with a correct skeleton; infinite for none
             within a second.
-        floor: whether the fit that starts at the truth has a true skeleton then.
+        floor: whether the skeleton, or else the last image's fit from the truth, is correct.
     """
 
     seconds: float
@@ -312,7 +312,7 @@ def run_walk(job: Job) -> WalkRun:
             begin = float(times[number])
             break
     assert begin is not None
-    # two images of the empty room, then from before the person is in view as a whole
+    # two images of the empty room, then images from shortly before the person is fully in view
     seen = chain(scene.frames(0.0, 2.0 / RATE), scene.frames(max(begin - 0.3, 3.0 / RATE), begin + WITHIN + 0.5 / RATE))
     view = DepthCamera(camera)
     for frame in seen:
@@ -338,7 +338,7 @@ def walk_figures(runs: Sequence[WalkRun]) -> dict[str, float]:
     }
 
 
-# --- what a Kinect's skeleton hides
+# --- motions that a Kinect's skeleton hides
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -347,9 +347,9 @@ class TrunkRun:
 
     Attributes:
         bend: (n,) radians.
-        lift: (n, 2) metres, of the left and the right shoulder.
-        lateral: (n,) radians, of the filter's lumbar and thoracic angle together; empty for the floor.
-        elevation: (n, 2) radians, of the filter's clavicles; empty for the floor.
+        lift: (n, 2) of the left and the right shoulder, metres.
+        lateral: (n,) of the sum of the filter's lumbar and thoracic angle, radians; none for the floor.
+        elevation: (n, 2) of the filter's clavicles, radians; none for the floor.
     """
 
     bend: dict[str, FloatArray]
@@ -359,7 +359,7 @@ class TrunkRun:
 
 
 def run_trunk(job: Job) -> TrunkRun:
-    """One person who bends, or shrugs."""
+    """One person who bends or shrugs."""
     scene = Performed(held_out(people(), job.seed), job.case, job.seed)
     frames = [*scene.frames()]
     stamps = [round(frame.time * NANOSECONDS) for frame in frames]
@@ -403,7 +403,7 @@ def run_trunk(job: Job) -> TrunkRun:
 
 
 def _angles(q: FloatArray) -> FloatArray:
-    """(32,) coordinates of a configuration that are angles about axes; 0 for the others."""
+    """(32,) coordinates of a configuration that are angles about axes, radians; 0 for the others."""
     found = np.zeros(MODEL.nv)
     found[MODEL.scalar_v] = q[MODEL.scalar_q]
     return found
@@ -415,14 +415,14 @@ def _free(errors: FloatArray) -> FloatArray:
 
 
 def _bend(points: FloatArray) -> FloatArray:
-    """(n,) radians by which the upper trunk leans to the right in the image against the lower one."""
+    """(n,) lean of the upper trunk to the right in the image against the lower trunk, radians."""
     lower = points[:, Joint.SPINE_MID] - points[:, Joint.SPINE_BASE]
     upper = points[:, Joint.SPINE_SHOULDER] - points[:, Joint.SPINE_MID]
     return np.asarray(np.arctan2(upper[:, 0], -upper[:, 1]) - np.arctan2(lower[:, 0], -lower[:, 1]))
 
 
 def _lift(points: FloatArray) -> FloatArray:
-    """(n, 2) metres of the shoulders over SpineShoulder, along the line from SpineBase to it."""
+    """(n, 2) heights of the shoulders over SpineShoulder along the line from SpineBase to it, metres."""
     up = points[:, Joint.SPINE_SHOULDER] - points[:, Joint.SPINE_BASE]
     up /= np.linalg.norm(up, axis=1, keepdims=True)
     shoulders = points[:, [Joint.SHOULDER_LEFT, Joint.SHOULDER_RIGHT]] - points[:, None, Joint.SPINE_SHOULDER]
@@ -448,7 +448,7 @@ def trunk_figures(runs: Sequence[TrunkRun], case: str) -> dict[str, dict[str, fl
 
 
 def run(job: Job) -> Any:
-    """Any job."""
+    """Run a job of any case."""
     return {"fast": run_fast, "walk in": run_walk}.get(job.case, run_trunk)(job)
 
 

@@ -1,12 +1,12 @@
 """A forearm of a simulated person hidden for half a second, with and without an inertial sensor on it.
 
-A board before one forearm for 0.5 s of every 1.2 s, left and right in turns, and inertial sensors on both forearms,
-with what an alignment leaves of their errors. Errors of the hidden elbow and wrist in these images, of the mesh
-without and with the sensors, of the simulated Kinect, and of the filter ``ekf`` behind the mesh, which takes the
-sensors itself, or only through the mesh, or both; the turn of the hand about the forearm (by the thumb, constant
-offset removed); and the share of coordinates within 1.96 stated deviations. ``floor`` is the fit of one image with
-the sensors that starts at the true joints: what an image and the sensors show without the images before. A second
-table is without the constant offset of each joint in a run, others are of each motion.
+A board hides one forearm for 0.5 s of every 1.2 s, left and right alternately; inertial sensors on both forearms have
+the errors left by an alignment. Errors of the hidden elbow and wrist in these images, of the mesh without and with the
+sensors, of the simulated Kinect, and of the filter ``ekf`` behind the mesh, which takes the sensors itself, or only
+through the mesh, or both; the turn of the hand about the forearm (by the thumb, constant offset removed); and the share
+of coordinates within 1.96 stated standard deviations. ``floor`` is the fit of one image with the sensors, started at
+the true joints: the information of an image and the sensors without earlier images. A second table is without the
+constant offset of each joint in a run, further tables are of each motion.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from body_tracking.simulation.people import MODEL
 MOTIONS = ("reaching", "two_handed_wave", "torso_twist")
 SEGMENTS = tuple(f"forearm_{side}" for side in SIDES)
 HIDDEN, EVERY, FIRST = 0.5, 1.2, 1.0
-"""Seconds: for which a forearm is hidden, from one to the next, and the first one."""
+"""Seconds for which a forearm is hidden, between two starts, and before the first."""
 VARIANTS = (
     "mesh",
     "mesh+sensor",
@@ -54,11 +54,11 @@ VARIANTS = (
     "ekf, mesh+sensor",
     "ekf+sensor, mesh+sensor",
 )
-"""Where the inertial sensors go."""
+"""Sources of the estimates, with the users of the inertial sensors."""
 _BOARD = 0.5
 """Distance of the board from the camera as a share of the arm's."""
 _FLOOR = 3
-"""The floor is that of every third image with a hidden forearm."""
+"""The floor is computed for every third image with a hidden forearm."""
 
 
 class Job(NamedTuple):
@@ -71,13 +71,13 @@ class Job(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HiddenRun:
-    """Errors in the images in which a forearm was hidden.
+    """Errors in the images with a hidden forearm.
 
     Attributes:
-        job: what was run.
+        job: motion, person and duration.
         sides: (n,) 0 or 1, the hidden forearm.
-        errors: (n, 2, 3) metres of the hidden elbow and wrist, by variant; NaN where there is no estimate.
-        turns: (n,) radians, of the hidden hand about the forearm, likewise.
+        errors: (n, 2, 3) of the hidden elbow and wrist, metres, by variant; NaN without an estimate.
+        turns: (n,) errors of the hidden hand's turn about the forearm, radians, by variant; NaN without an estimate.
         within: (n, 2, 3) whether each coordinate is within 1.96 stated deviations; NaN where none is stated.
     """
 
@@ -89,13 +89,13 @@ class HiddenRun:
 
 
 def hidden_side(time: float) -> int | None:
-    """0 or 1, the forearm behind the board at so many seconds; None for neither."""
+    """0 or 1 for the forearm behind the board at a time in seconds; None for neither."""
     number, since = divmod(time - FIRST, EVERY)
     return int(number) % 2 if number >= 0 and since < HIDDEN else None
 
 
 def behind_board(depth: SingleArray, camera: Camera, joints: FloatArray, side: int) -> SingleArray:
-    """The image (metres) with a board before the forearm and the hand of (25, 3) joints in the optical frame."""
+    """The image (metres) with a board in front of forearm and hand of (25, 3) joints in the optical frame."""
     name = SIDES[side].upper()
     arm = joints[[Joint[f"{joint}_{name}"] for joint in ("ELBOW", "WRIST", "HAND_TIP")]]
     nearer = _nearer(joints, side)
@@ -107,7 +107,7 @@ def behind_board(depth: SingleArray, camera: Camera, joints: FloatArray, side: i
 
 
 def _nearer(joints: FloatArray, side: int) -> float:
-    """Metres to the board before the forearm of (25, 3) joints."""
+    """Distance of the board in front of the forearm of (25, 3) joints, metres."""
     return _BOARD * float(
         joints[[Joint[f"{name}_{SIDES[side].upper()}"] for name in ("ELBOW", "WRIST", "HAND_TIP")], 2].min()
     )
@@ -132,7 +132,7 @@ def worn(scene: DepthScene, seconds: float) -> list[SegmentOrientation]:
 
 
 def run(job: Job) -> HiddenRun:
-    """One person in one motion, with a forearm hidden now and then."""
+    """One person in one motion, with a forearm hidden repeatedly."""
     scene = scene_of(job.motion, job.seed)
     frames = [*scene.frames(0.0, job.seconds)]
     truth = {round(frame.time * NANOSECONDS): frame.joints for frame in frames}
@@ -164,7 +164,7 @@ def run(job: Job) -> HiddenRun:
             tracks[behind if name == "mesh" else f"{behind}, mesh+sensor"] = {
                 stamp: (
                     (each.positions - pose.translation) @ pose.rotation,
-                    # infinite for the legs, which the filter does not model
+                    # infinite for the legs, which are not in the filter's model
                     pose.rotation.T @ np.where(np.isfinite(each.covariances), each.covariances, np.nan) @ pose.rotation,
                 )
                 for stamp, (each,) in filtered
@@ -198,7 +198,7 @@ def run(job: Job) -> HiddenRun:
 def orientations_at(
     measured: Sequence[SegmentOrientation], pose: SensorPose, stamps: Sequence[int], names: Sequence[str]
 ) -> dict[int, list[Orientation]]:
-    """The orientations at the times of images as the mesh takes them."""
+    """The orientations at the times of images, as the mesh takes them."""
     placement, worn_now, found = Placement(), SensorOrientations(SEGMENTS), {}
     placement.set_pose(pose)
     rest = [*measured]
@@ -214,7 +214,7 @@ def _arm(side: int) -> list[int]:
 
 
 def _kinect(scene: DepthScene, joints: FloatArray) -> FloatArray:
-    """(n, 25, 3) metres in the optical frame: what a Kinect reports of true joints there behind the same board."""
+    """(n, 25, 3) joints of a Kinect behind the same board, from true joints, metres in the optical frame."""
     board = np.tile([50.0, 0.0, 1.0], (len(joints), len(Joint), 1))
     for number in range(len(joints)):
         if (side := hidden_side(number / RATE)) is not None:
@@ -225,18 +225,18 @@ def _kinect(scene: DepthScene, joints: FloatArray) -> FloatArray:
 
 
 def _turn(off: FloatArray, true: FloatArray) -> float:
-    """Radians by which elbow, wrist and thumb with errors (3, 3) are turned about the forearm against true ones."""
+    """Turn of elbow, wrist and thumb with errors (3, 3) about the forearm against the true ones, radians."""
     axis = (true[1] - true[0]) / np.linalg.norm(true[1] - true[0])
     across = [each[2] - each[1] - ((each[2] - each[1]) @ axis) * axis for each in (true + off, true)]
     return float(np.arctan2(np.cross(across[1], across[0]) @ axis, across[1] @ across[0]))
 
 
 def figures_of(runs: Sequence[HiddenRun], *, offset: bool = True) -> dict[str, dict[str, float]]:
-    """Mean errors of several runs in the images that all variants but the floor have, by variant.
+    """Mean errors of several runs by variant, in the images with estimates by all variants but the floor.
 
     Args:
         runs: the runs.
-        offset: with each joint's constant offset in a run, of each side.
+        offset: keep each joint's constant offset in a run, per side.
     """
     compared = [name for name in VARIANTS if name != "floor"]
     known = {id(run): np.all([np.isfinite(run.errors[n]).all(axis=(1, 2)) for n in compared], axis=0) for run in runs}

@@ -1,14 +1,14 @@
 """The mesh fitted to real depth images: a Kinect v2's of a walker, and 34 views of one person who turns.
 
-``rms`` is the distance of the measured points from the surface, point to plane, millimetres, of the points within
-60 mm of it, whose share is ``points``; ``rms of all`` is that of all points. ``overlap`` is the intersection over the
-union of the rendered mesh and the person's mask, among the pixels that were measured. The mask of ``kinect_depth`` also
-has specks of the treadmill: its largest piece is used, after an opening by 5 pixels.
+``rms`` is the distance point to plane of the measured points from the surface, millimetres, over the points within
+60 mm of it; their share is ``points``; ``rms of all`` is over all points. ``overlap`` is the intersection over the
+union of the rendered mesh and the person's mask, over the measured pixels. The mask of ``kinect_depth`` also has specks
+of the treadmill: its largest piece is used, after an opening by 5 pixels.
 
 The views of ``depth_turn`` are tracked as a sequence of 10 images per second: with the mean person's body, then with
-that of the person from six of the views; figures are of the other 28. ``torso`` is the angle between the turns of the
-thorax and of the camera from one view to another, degrees, median over all pairs of views. It has what the person bent
-and twisted between them. The last row finds the person without the masks.
+the person's body from six of the views; figures are of the other 28. ``torso`` is the angle between the rotations of
+the thorax and of the camera between two views, degrees, median over all pairs of views; it includes the person's own
+bending and twisting. In the last row the person is found without the masks.
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ SETS = ((0, 6, 11, 17, 23, 28), (3, 9, 14, 20, 26, 31))
 """Two disjoint sets of views for the person's shape, each about 60 degrees apart."""
 _VIEWS = 34
 _RATE = 10.0
-"""Images per second; every third of a sequence at about 30."""
+"""Images per second: the benchmark uses every third image of a sequence at about 30."""
 
 
 class View(NamedTuple):
-    """An image of the person who turns.
+    """An image of the turning person.
 
     Attributes:
         depth: (480, 640) metres, 0 where missing.
         mask: (480, 640) the person's pixels.
-        turn: (3, 3) from the camera's axes into those of the person.
+        turn: (3, 3) rotation from the camera's axes to the person's.
     """
 
     depth: SingleArray
@@ -60,7 +60,7 @@ class View(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """The person in one image: what was observed, and the fit."""
+    """The observation of the person in one image, and the fit."""
 
     observation: Observation
     fit: Fit
@@ -81,14 +81,14 @@ def figures_of(shown: Shown, mask: BoolArray, faces: Any) -> dict[str, float]:
 
 
 def largest_piece(mask: BoolArray) -> BoolArray:
-    """A mask without specks."""
+    """The largest piece of a mask, after an opening."""
     opened = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
     _, labels, statistics, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
     return np.asarray(labels == 1 + statistics[1:, cv2.CC_STAT_AREA].argmax())
 
 
 def walker(folder: Path, pictures: Path | None) -> dict[str, dict[str, float]]:
-    """The Kinect's image, from a search: with the mean person's body, and with a shape from this one image."""
+    """The Kinect's image, by a search: with the mean person's body, and with a shape from this one image."""
     files = recordings(folder, ("lab_004378_depth.png", "lab_004378_mask.png"))
     pixels, masked = (cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in files)
     depth = to_metres(pixels)
@@ -121,7 +121,7 @@ def read_views(folder: Path) -> list[View]:
 def tracked(
     views: Sequence[View], view: DepthCamera, body: Body, covariance: FloatArray, *, masked: bool = True
 ) -> dict[int, Shown]:
-    """The views in which the person was tracked, by their numbers."""
+    """The views with a tracked person, by number."""
     tracker, found = MeshTracker(view, body, covariance), {}
     for number, (depth, mask, _) in enumerate(views):
         index = np.where(mask, 0, NO_BODY).astype(np.uint8) if masked else None
@@ -133,13 +133,13 @@ def tracked(
 
 
 def person_of(views: dict[int, Shown], chosen: Iterable[int], body: Body) -> Person:
-    """The person's shape from those of the chosen views in which they were tracked."""
+    """The person's shape from the chosen views in which they were tracked."""
     used = [views[number] for number in chosen if number in views]
     return personalise(body.model, [each.observation for each in used], [each.fit.pose for each in used])
 
 
 def torso(views: Sequence[View], shown: dict[int, Shown], chosen: Sequence[int], thorax: int) -> dict[str, float]:
-    """Degrees between the turns of the thorax and of the camera: medians over all pairs, and over neighbours."""
+    """Angles between the rotations of thorax and camera, degrees: medians over all pairs, and over neighbours."""
     turns = {number: views[number].turn @ shown[number].fit.frames[thorax] for number in chosen if number in shown}
 
     def median(pairs: Iterable[tuple[FloatArray, FloatArray]]) -> float:
@@ -150,7 +150,7 @@ def torso(views: Sequence[View], shown: dict[int, Shown], chosen: Sequence[int],
 
 
 def turning(folder: Path, pictures: Path | None) -> dict[str, Any]:
-    """The person who turns: figures of the views that the shape does not come from, and shoulder widths."""
+    """The turning person: figures of the views that were not used for the shape, and shoulder widths."""
     views = read_views(folder)
     matrix = np.array([[525.0, 0.0, 320.0], [0.0, 525.0, 240.0], [0.0, 0.0, 1.0]])
     view = DepthCamera(Camera("depth_turn", 640, 480, matrix, np.zeros(5)))

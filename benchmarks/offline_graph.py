@@ -1,4 +1,4 @@
-"""The graph as ``body_tracking replay`` runs it, in memory."""
+"""The graph of ``body_tracking replay``, in memory."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from body_tracking.systems import STAGES, stage_class
 
 
 class OfflineGraph:
-    """Calibration to joint angles, fed with messages.
+    """The stages from calibration to joint angles, fed with messages.
 
     Args:
         settings: with the sensors.
-        sink: gets topic, message and time of all that goes in and comes out.
-        topics: those that go in.
+        sink: called with topic, message and time (ns) of each input and output.
+        topics: of the inputs.
 
     Attributes:
         stages: by name.
@@ -40,15 +40,15 @@ class OfflineGraph:
         self._downstream.push(topic, cdr, at_ns)
 
     def start(self, at_ns: int) -> None:
-        """Before the first message."""
+        """Start the calibration and fusion, before the first message."""
         self._upstream.start(at_ns)
 
     def push(self, topic: str, cdr: bytes, at_ns: int) -> None:
-        """One message of a sensor."""
+        """Pass on one message of a sensor."""
         self._pass(topic, cdr, at_ns)
         self._upstream.push(topic, cdr, at_ns)
 
     def finish(self, at_ns: int) -> None:
-        """After the last message."""
+        """Finish all stages, after the last message."""
         self._upstream.finish(at_ns)
         self._downstream.finish(at_ns)

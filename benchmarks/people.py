@@ -1,15 +1,13 @@
-"""Several people: who is whom in crossings, in a real recording of two people, and six of them live.
+"""Several people: identities in crossings, in a real recording of two people, and of six people live.
 
-1. Simulated people who walk past each other, one or two sensors, with poses that are a little wrong, as calibrations
-   are. The sensors' own numbers of bodies are those of a Kinect (a body that was lost comes back with the lowest free
-   one), or shuffled in every frame, which makes them worthless. Counted are identity switches (Bernardin and
-   Stiefelhagen 2008, "Evaluating multiple object tracking performance: the CLEAR MOT metrics"): how often the number of
-   a true person changes.
-2. Two people seen by two real sensors (KinectMultiTrack). Nobody knows who is whom there; counted are the numbers that
-   were given, assignments that were changed, and jumps of a person by more than half a metre between two frames of a
-   sensor.
-3. Six people before two sensors at 30 Hz through the live graph: rates, delays over time, what was dropped and what
-   diagnostics said, with the default filter and with the extended one.
+1. Simulated people who walk past each other, one or two sensors, with the errors of the poses that calibrations have.
+   The sensors' own body numbers are those of a Kinect (a body that was lost returns with the lowest free one), or
+   shuffled in every frame, which makes them worthless. Identity switches are counted (Bernardin and Stiefelhagen 2008,
+   "Evaluating multiple object tracking performance: the CLEAR MOT metrics"): changes of a true person's number.
+2. Two people seen by two real sensors (KinectMultiTrack), without a truth. Counted are the assigned numbers, changed
+   assignments, and jumps of a person by more than half a metre between two frames of a sensor.
+3. Six people in front of two sensors at 30 Hz through the live graph: rates, delays over time, dropped messages and
+   diagnostics, with the default filter and with the extended one.
 """
 
 from __future__ import annotations
@@ -55,7 +53,7 @@ EVERYBODY = PeopleParameters(ALL)
 
 
 def crossing(seed: int, sensors: int, people: int = 2, seconds: float = 20.0) -> SimulatedRecording:
-    """People who walk to and fro in lanes, which lie across the sensors' views or obliquely."""
+    """People who walk to and fro in lanes, across the sensors' views or obliquely."""
     rng = np.random.default_rng([seed, 11])
     azimuths = np.radians(rng.uniform(-40.0, 40.0) + np.array([0.0, rng.uniform(50.0, 90.0)]))[:sensors]
     apart = float(rng.uniform(0.55, 0.8))
@@ -73,19 +71,19 @@ def crossing(seed: int, sensors: int, people: int = 2, seconds: float = 20.0) ->
 
 
 def moved(pose: SensorPose, rng: np.random.Generator) -> SensorPose:
-    """A pose as a calibration has it: wrong by some centimetres and a degree or two."""
+    """A pose with the errors of a calibration: some centimetres and a degree or two."""
     turn = Rotation.from_rotvec(np.radians(1.5) * rng.normal(size=3)) * Rotation.from_matrix(pose.rotation)
     return SensorPose(pose.sensor, pose.translation + 0.04 * rng.normal(size=3), turn.as_quat())
 
 
 def shuffled(skeletons: tuple[Skeleton, ...], rng: np.random.Generator) -> tuple[Skeleton, ...]:
-    """The same bodies with other numbers, in another order."""
+    """The same bodies with shuffled numbers, in the order of these."""
     numbers = rng.permutation(6)[: len(skeletons)].tolist()
     return tuple(sorted((replace(s, body=n) for s, n in zip(skeletons, numbers, strict=True)), key=lambda s: s.body))
 
 
 def switches(recording: SimulatedRecording, worthless: bool, seed: int) -> dict[str, int]:
-    """What happens to the numbers of people in one recording."""
+    """Counts of frames, identity switches and events of the association in one recording."""
     rng = np.random.default_rng([seed, 12])
     sensors = {sensor.pose.sensor: sensor for sensor in recording.sensors}
     people = People(tuple(sensors), EVERYBODY)
@@ -94,7 +92,7 @@ def switches(recording: SimulatedRecording, worthless: bool, seed: int) -> dict[
         people.set_clock(sensor.pose.sensor, 0, sensor.clock)
     middles = np.stack([truth.positions[:, _TRUNK].mean(axis=1) for truth in recording.truths], axis=1)
     stamps = recording.truths[0].stamps_ns
-    # since when, and until when, some sensor has seen everybody all the time
+    # begin and end of the latest period in which some sensor saw all people
     whole_since_ns = whole_ns = -(10**18)
     last: dict[int, int] = {}
     counted: Counter[str] = Counter({"frames": 0, "switches": 0, "switches while all were visible to a sensor": 0})
@@ -123,7 +121,7 @@ def switches(recording: SimulatedRecording, worthless: bool, seed: int) -> dict[
 
 
 def crossings(seeds: Iterable[int]) -> list[dict[str, Any]]:
-    """The first measurement."""
+    """Part 1."""
     rows = []
     cases = [(people, sensors) for people in (2, 3) for sensors in (1, 2)]
     for people, sensors in cases:
@@ -143,7 +141,7 @@ def crossings(seeds: Iterable[int]) -> list[dict[str, Any]]:
 
 
 def real(file: Path, folder: Path) -> dict[str, Any]:
-    """The second measurement."""
+    """Part 2."""
     bag = folder / "two_people"
     import_files([file], bag)
     result, _ = calibrate(bag, CalibrationParameters())
@@ -168,7 +166,7 @@ def real(file: Path, folder: Path) -> dict[str, Any]:
             counted["frames"] += 1
             counted["bodies"] += len(skeletons)
             at_ns = result.clocks[sensor].to_reference(skeletons[0].stamp_ns)
-            # the recording has pauses that are longer than anybody is waited for
+            # the recording has pauses that are longer than a lost person is kept
             counted["parts"] += at_ns - newest_ns > EVERYBODY.hold * NANOSECONDS
             newest_ns = max(newest_ns, at_ns)
             found = people.sort(sensor, skeletons)
@@ -203,14 +201,14 @@ def real(file: Path, folder: Path) -> dict[str, Any]:
 
 
 def streams_of(recording: SimulatedRecording) -> dict[str, live.Stream]:
-    """What each sensor saw, to and fro."""
+    """Endless stream of each sensor, forwards and backwards."""
     names = [sensor.pose.sensor for sensor in recording.sensors]
     frames = {name: [frame.skeletons for frame in recording.frames if frame.sensor == name] for name in names}
     return live.streams(frames, {sensor.pose.sensor: sensor.clock for sensor in recording.sensors})
 
 
 class Ear(live.Bench):
-    """Counts besides how often diagnostics said that a node is too slow."""
+    """Also counts diagnostics that report a node as too slow."""
 
     def __init__(self) -> None:
         super().__init__("people_bench")
@@ -224,7 +222,7 @@ class Ear(live.Bench):
 
 
 def run_live(filter_name: str, recording: SimulatedRecording, people: int, seconds: float) -> dict[str, Any]:
-    """The third measurement."""
+    """Part 3 with one filter."""
     streams, ear = streams_of(recording), Ear()
     poses = {sensor.pose.sensor: sensor.pose for sensor in recording.sensors}
     by_sensor = role_of({"filter": filter_name}).input == graph.SENSORS_INPUT
@@ -256,7 +254,7 @@ def run_live(filter_name: str, recording: SimulatedRecording, people: int, secon
 
 
 def figures_of(ear: Ear, seconds: float) -> dict[str, Any]:
-    """Figures of one run; the first fifth, while everything starts, is not among the delays."""
+    """Figures of one run; delays are without the first fifth, in which the nodes start."""
     rows = [np.array(sorted(received.items())).reshape(-1, 2) for received in ear.received.values()]
     stamps, received = np.concatenate(rows).T
     delays, stamps = (received - stamps) / 1e6, (stamps - ear.start_ns) / NANOSECONDS
@@ -282,7 +280,7 @@ def figures_of(ear: Ear, seconds: float) -> dict[str, Any]:
 
 
 def main() -> int:
-    """The benchmark; exit code 1 where a number was exchanged that should not have been."""
+    """The benchmark; exit code 1 for an identity switch while all people were visible to a sensor."""
     parser = common.parser(__doc__, data=True, seeds=10)
     parser.add_argument("--only", choices=("crossings", "real", "live"), help="one of the three")
     parser.add_argument("--people", type=int, default=6, metavar="N", help="live (default: %(default)s)")

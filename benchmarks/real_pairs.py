@@ -1,13 +1,13 @@
-"""Nine recordings of two real Kinect v2 sensors: calibration, agreement and left and right, beside the thesis's method.
+"""Nine recordings of two real Kinect v2 sensors: calibration, agreement, left and right, beside the thesis's method.
 
-Imports each recording of ``kinect_pairs`` into a bag, runs the graph over it offline (``body_tracking replay``) and
+Imports each recording of ``kinect_pairs`` into a bag, replays the graph over it (``body_tracking replay``) and
 calibrates it with both methods (``body_tracking calibrate``). The taped marks give the true relative yaw.
 
-With ``--ekf`` the extended filter on the same people, of whom nothing is known but that they stay the same:
+With ``--ekf`` the extended filter on the same people; their true dimensions are unknown, but constant:
 
 lengths   segment lengths from the first half of each recording (fused skeletons) against those from the second half,
-          both from scratch: the greatest difference of the 21, what is stated of it, and the median.
-NIS       the normalised innovation squared over its expectation, sums over all frames after the first seconds: of the
+          both estimated from scratch: the largest difference of the 21, its stated standard deviation, and the median.
+NIS       normalised innovation squared over its expectation, summed over all frames after the first seconds: of the
           fused skeletons, and of both calibrated sensors unpaired, each frame at its own time. 1 is consistent; more:
           stated deviations are too small; less: too large (Bar-Shalom, Li and Kirubarajan 2001, chapter 5.4.2).
 """
@@ -47,13 +47,13 @@ NOMINAL = {"parallel": 0.8, "45deg": -45.8, "90deg": -88.0}
 """Relative yaw of kinect2 to kinect1 in Kinect camera axes, degrees."""
 
 LIMITS = {"parallel": 36.0, "45deg": 62.0, "90deg": 107.0}
-"""Most that the two sensors may disagree on a joint, mean over joints and frames, median over recordings, mm."""
+"""Largest distance of a joint between the two sensors: mean over joints and frames, median over recordings, mm."""
 
 LENGTH_BAR, NIS_BAR = 0.010, (0.7, 1.4)
-"""Metres; of the extended filter."""
+"""Bars of the extended filter: difference of lengths, metres; bounds of the NIS."""
 
 LEARNING = 2.0
-"""Seconds at the start, and after a gap, that do not count for the NIS: the filter is learning the noise."""
+"""Seconds at the start and after a gap that do not count for the NIS: the filter learns the noise."""
 
 PEOPLE = ("p02", "p07", "p12")
 
@@ -62,7 +62,7 @@ PAUSE = 5.0
 
 
 def skeletons(bag: Path, topic: str) -> list[Skeleton]:
-    """All of a topic's skeletons, in order of their stamps."""
+    """All skeletons of a topic, in the order of their stamps."""
     with RigReader(bag) as reader:
         found = [decode_skeletons(raw.cdr) for raw in reader.messages([topic])]
     return sorted((each[0] for each in found if each), key=lambda each: each.stamp_ns)
@@ -71,15 +71,15 @@ def skeletons(bag: Path, topic: str) -> list[Skeleton]:
 def paired(
     one: Sequence[Skeleton], two: Sequence[Skeleton], result: CalibrationResult
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """What both sensors say at the captures of the first, where the second has frames close before and after.
+    """Positions by both sensors at the captures of the first, where the second has frames close before and after.
 
     Args:
-        one: frames of kinect1, in order of their stamps.
-        two: of kinect2.
-        result: where both stand, and how their clocks run.
+        one: frames of kinect1, in the order of their stamps.
+        two: frames of kinect2.
+        result: poses and clocks of both.
 
     Returns:
-        (n,) nanoseconds of kinect1's clock; (n, 25, 3) metres in ``world`` by kinect1; the same by kinect2.
+        (n,) nanoseconds of kinect1's clock; (n, 25, 3) positions in ``world`` by kinect1, metres; the same by kinect2.
     """
     clock = result.clocks["kinect2"]
     stamps = np.array([clock.to_reference(each.stamp_ns) for each in two])
@@ -95,13 +95,13 @@ def paired(
 
 
 def disagreement(bag: Path, result: CalibrationResult) -> float:
-    """Mean distance between what both sensors say of a joint, all joints, all frames that both cover; metres."""
+    """Mean distance of a joint between both sensors, over all joints and all frames covered by both, metres."""
     _, ours, theirs = paired(skeletons(bag, "/kinect1/skeleton"), skeletons(bag, "/kinect2/skeleton"), result)
     return float(np.linalg.norm(ours - theirs, axis=-1).mean())
 
 
 def settling(bag: Path, movement_ns: int, nominal: float) -> float:
-    """Seconds of movement until the published yaw is within 3 degrees of the marks and stays there."""
+    """Seconds of movement until the published yaw is within 3 degrees of the marks for good."""
     reference, wrong_until = None, movement_ns
     with RigReader(bag) as reader:
         for raw in reader.messages([CALIBRATION]):
@@ -117,13 +117,13 @@ def settling(bag: Path, movement_ns: int, nominal: float) -> float:
 
 
 def reversals(axes: FloatArray) -> int:
-    """How often an axis turns by more than a right angle from one frame to the next."""
+    """Number of turns of an axis by more than a right angle between two frames."""
     axes = axes[np.isfinite(axes).all(axis=1)]
     return int((np.einsum("ni,ni->n", axes[1:], axes[:-1]) <= 0.0).sum())
 
 
 def unpaired_frames(bag: Path, result: CalibrationResult) -> list[tuple[str, Skeleton]]:
-    """Each sensor's frames in world, in the order in which they arrived."""
+    """Each sensor's frames in world, in the order of receipt."""
     with RigReader(bag) as reader:
         topics = sensor_topics(reader)
         alignment = SensorAlignment(tuple(topics.values()), result.reference)
@@ -147,7 +147,7 @@ def learnt(frames: Sequence[tuple[str, Skeleton]], parameters: EkfParameters) ->
 
 
 def halves(frames: Sequence[tuple[str, Skeleton]], parameters: EkfParameters) -> dict[str, Any]:
-    """Lengths of the first half of the time against those of the second one, metres."""
+    """Difference between the lengths from the first half of the time and from the second, metres."""
     stamps = [skeleton.stamp_ns for _, skeleton in frames]
     middle = (min(stamps) + max(stamps)) // 2
     parts = [[frame for frame in frames if (frame[1].stamp_ns < middle) == first] for first in (True, False)]
@@ -189,7 +189,7 @@ def of_ekf(bag: Path, out: Path, result: CalibrationResult, parameters: EkfParam
 
 
 def measure(file: Path, folder: Path, parameters: EkfParameters | None = None) -> dict[str, Any]:
-    """All figures of one recording; those of the extended filter where its parameters are given."""
+    """All figures of one recording; with ``parameters`` also those of the extended filter."""
     layout = file.name.split("_")[1].split(".")[0]
     bag, out = folder / f"{file.name}.bag", folder / f"{file.name}.out"
     import_files([file], bag)
@@ -213,7 +213,7 @@ def measure(file: Path, folder: Path, parameters: EkfParameters | None = None) -
 
 
 def missed_bars(rows: Sequence[Mapping[str, Any]], medians: Mapping[str, Mapping[str, float]]) -> list[str]:
-    """What misses its bar."""
+    """Names of the missed bars."""
     missed = [f"{layout}: apart" for layout, own in medians.items() if own["robust"] > LIMITS[layout]]
     low, high = NIS_BAR
     for row in rows:
@@ -230,7 +230,7 @@ def missed_bars(rows: Sequence[Mapping[str, Any]], medians: Mapping[str, Mapping
 
 
 def show(rows: Sequence[Mapping[str, Any]], medians: Mapping[str, Mapping[str, float]], missed: Sequence[str]) -> None:
-    """The tables."""
+    """Print the tables."""
     print("                 yaw, degrees                          apart, mm")
     print("recording        marks  default +-sd  thesis  settled  default  thesis  clock  reversals  speed")
     for row in rows:
@@ -259,7 +259,7 @@ def show(rows: Sequence[Mapping[str, Any]], medians: Mapping[str, Mapping[str, f
 
 
 def main() -> int:
-    """The benchmark; exit code 1 where a figure misses its bar."""
+    """The benchmark; exit code 1 where a bar is missed."""
     parser = common.parser(__doc__, data=True)
     parser.add_argument("--only", metavar="NAME", default="", help="recordings whose name contains this")
     parser.add_argument("--ekf", action="store_true", help="the extended filter, too")

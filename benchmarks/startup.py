@@ -1,7 +1,7 @@
 """How long a user waits: --help, the first line of up, the first joint angle and the page of the viewer, in seconds.
 
-``body_tracking up --bag bags/tpose_wave``, with and without ``--viewer``, is started anew each time; a listener in
-another process takes the time of the first joint angles that have a value. Times are from the start of the command.
+``body_tracking up --bag bags/tpose_wave``, with and without ``--viewer``, is started anew each time; a subscriber in
+another process notes the receipt of the first finite joint angles. Times are from the start of the command.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ import common
 import numpy as np
 
 LIMITS = {"--help": 0.5, "up, first line": 1.0, "first angle": 5.0, "page": 5.0}
-"""Seconds, on two cores with nothing else to do."""
+"""Bars in seconds, on an idle machine with two cores."""
 PATIENCE = 120.0
 COMMAND = (sys.executable, "-m", "body_tracking.cli")
 BAG = common.ROOT / "bags" / "tpose_wave"
 
 
 class Listener:
-    """Takes the steady time of the first joint angles with a value."""
+    """Notes the monotonic time of the first finite joint angles."""
 
     def __init__(self) -> None:
         import rclpy
@@ -60,14 +60,14 @@ class Listener:
 
 
 def help_time() -> float:
-    """Seconds of ``body_tracking --help``."""
+    """Duration of ``body_tracking --help``, seconds."""
     begin = time.monotonic()
     subprocess.run([*COMMAND, "--help"], check=True, stdout=subprocess.DEVNULL)
     return time.monotonic() - begin
 
 
 def up_times(listener: Listener, *, viewer: bool) -> dict[str, float]:
-    """Seconds until the first line and the first angle, and with a viewer until the page is served."""
+    """Seconds until the first line and the first angle; with a viewer instead of the angle until the page is served."""
     found: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as folder:
         words = ("up", "--bag", BAG, "--log-dir", folder, *(("--viewer",) if viewer else ()))
@@ -101,7 +101,7 @@ def up_times(listener: Listener, *, viewer: bool) -> dict[str, float]:
 
 
 def main() -> int:
-    """The command: 0, also when a target is missed; the figures say it."""
+    """The command; the exit code is 0 even if a target is missed."""
     parser = common.parser(__doc__)
     parser.add_argument("--runs", type=int, default=5, metavar="N", help="of each (default: %(default)s)")
     args = parser.parse_args()

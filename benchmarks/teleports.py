@@ -1,21 +1,21 @@
-"""Do published angles teleport? Steps between frames that no person makes, and what a replay costs with each filter.
+"""Do published angles teleport? Impossible steps between frames, and the cost of a replay with each filter.
 
-A teleport is a step of an angle by more than 60 degrees between two frames, no more than 0.1 s apart, with stated
-deviations below 15 degrees. Every angle of the filter's default convention counts, in three kinds of recordings:
+A teleport is a step of an angle by more than 60 degrees between two frames at most 0.1 s apart, with stated standard
+deviations below 15 degrees. All angles of the filter's default convention count, in three kinds of recordings:
 
-simulated   people of seeds that nothing was tuned on: all motions by turns, layouts 1 to 9 by turns
+simulated   people with seeds on which nothing was tuned: all motions in turn, layouts 1 to 9 in turn
 pairs       the nine real pairs of Kinect v2 sensors (``kinect_pairs``)
-clips       real exercises of the right arm before one Kinect v2 (``kinect_vs_vicon``)
+clips       real exercises of the right arm in front of one Kinect v2 (``kinect_vs_vicon``)
 
-``unusual`` is the share of the known shoulders (all three deviations below 15 degrees, conventions of the model) whose
-angles are those of an unusual branch: in the sum more than 30 degrees outside their usual ranges, where the equivalent
-triple of the same rotation is inside. A step and an unusual branch both mislead who follows the angles.
+``unusual`` is the share of the known shoulders (all three standard deviations below 15 degrees, conventions of the
+model) in an unusual branch: the angles are outside their usual ranges by a sum of more than 30 degrees, and the
+equivalent triple of the same rotation is inside. Both a step and an unusual branch mislead a user of the angles.
 
-Recordings and pairs are replayed as ``body_tracking replay`` does, both filters in turns; clips are filtered frame by
+Recordings and pairs are replayed as by ``body_tracking replay``, with each filter in turn; clips are filtered frame by
 frame. ``known`` is the share of the frames with angles in which elevation, plane of elevation, elbow and trunk angles
-are stated with a deviation below 15 degrees (the plane where the arm is raised by 30 to 150). ``cpu`` is the
-processor time of a replay, both halves, in seconds per second of the recording; ``speed`` how many times faster than
-the recording it was, which depends on what else the machine does.
+have a stated standard deviation below 15 degrees (the plane where the arm is raised by 30 to 150 degrees). ``cpu`` is
+the processor time of a replay, both processes, in seconds per second of the recording; ``speed`` is the duration of the
+recording over that of the replay, which depends on the load of the machine.
 """
 
 from __future__ import annotations
@@ -49,21 +49,21 @@ from body_tracking.simulation.scene import Setup, simulate
 FILTERS = (DEFAULT_FILTER, "ekf")
 STEP, SURE = np.radians(60.0), np.radians(15.0)
 SOON_NS = NANOSECONDS // 10
-"""Frames that are farther apart do not follow each other."""
+"""Frames that are farther apart are not compared."""
 ALLOWED = 0
-"""Teleports."""
+"""Allowed number of teleports."""
 KNOWN = 90.0
 """Percent of the frames of a real pair."""
 PARTS = ("simulated", "pairs", "clips")
 RAISED = np.radians(30.0), np.radians(150.0)
 _UNUSUAL = np.radians(30.0)
 _FIRST_SEED = 5300
-"""Far from the seeds of every other benchmark."""
+"""Far from the seeds of all other benchmarks."""
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A recording to look at: its part, its name, and its file or the number of the simulated run."""
+    """A recording to evaluate: its part, its name, and its file or the number of the simulated run."""
 
     part: str
     name: str
@@ -72,7 +72,7 @@ class Job:
 
 
 def teleports(angles: AngleSeries) -> list[str]:
-    """Where: the angle, the second, and the step in degrees."""
+    """Per teleport: the angle, its time in seconds, and the step in degrees."""
     steps = np.abs(wrapped(np.diff(angles.position, axis=0)))
     sure = np.maximum(angles.stddev[1:], angles.stddev[:-1]) < SURE
     sure &= (np.diff(angles.stamps_ns) < SOON_NS)[:, None]
@@ -84,7 +84,7 @@ def teleports(angles: AngleSeries) -> list[str]:
 
 
 def unusual(angles: AngleSeries) -> tuple[int, int]:
-    """How many shoulders are known, and how many of these are in an unusual branch."""
+    """Number of known shoulders, and number of those in an unusual branch."""
     found = np.zeros(2, dtype=np.int64)
     model = UpperBody()
     chains = [
@@ -96,7 +96,8 @@ def unusual(angles: AngleSeries) -> tuple[int, int]:
         columns = [angles.names.index(str(name)) for name in chain.names]
         triples, (low, high) = angles.position[:, columns], np.radians(np.array(chain.angles.usual)).T
         first, _, last = chain.angles.axes
-        # two angles half a turn away, and the middle one mirrored: at 0 for proper Euler angles, at 90 for Cardan ones
+        # the equivalent triple adds half a turn to two angles and mirrors the middle one: at 0 for proper Euler angles,
+        # at 90 degrees for Cardan angles
         mirrored = (0.0 if abs(first @ last) > 0.5 else np.pi) - triples[:, 1]
         others = np.stack([triples[:, 0] + np.pi, mirrored, triples[:, 2] + np.pi], axis=1)
         own, other = (_outside(each, low, high) for each in (triples, others))
@@ -106,7 +107,7 @@ def unusual(angles: AngleSeries) -> tuple[int, int]:
 
 
 def _outside(triples: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """(n,) by how much (n, 3) angles, but for full turns, leave their ranges in the sum, radians."""
+    """(n,) sum of the amounts by which (n, 3) angles, modulo full turns, leave their ranges, radians."""
     middle = 0.5 * (low + high)
     inside = middle + wrapped(triples - middle)
     outside: FloatArray = np.maximum(np.maximum(inside - high, low - inside), 0.0).sum(axis=1)
@@ -114,7 +115,7 @@ def _outside(triples: FloatArray, low: FloatArray, high: FloatArray) -> FloatArr
 
 
 def known(angles: AngleSeries) -> dict[str, float]:
-    """Percentage of the frames in which an angle is stated with a small deviation, the least of each kind."""
+    """Percentage of the frames in which an angle has a small stated standard deviation, the least of each kind."""
     trunk = "thorax" if any(name.startswith("thorax") for name in angles.names) else "trunk"
     kinds = {"elevation": "shoulder_elevation", "plane": "shoulder_plane", "elbow": "elbow", "trunk": trunk}
     found: dict[str, float] = {}
@@ -132,7 +133,7 @@ def known(angles: AngleSeries) -> dict[str, float]:
 
 
 def _raised(angles: AngleSeries, side: str) -> BoolArray:
-    """(n,) whether the plane of elevation of an arm means anything."""
+    """(n,) whether the plane of elevation of an arm is well defined."""
     elevation = np.abs(angles.position[:, angles.names.index(f"shoulder_elevation_{side}")])
     raised: BoolArray = (elevation > RAISED[0]) & (elevation < RAISED[1])
     return raised
@@ -201,12 +202,12 @@ def of_clip(job: Job) -> dict[str, dict[str, Any]]:
 
 
 def measure(job: Job) -> dict[str, dict[str, Any]]:
-    """The figures of any recording."""
+    """The figures of a recording of any part."""
     return of_clip(job) if job.part == "clips" else of_replays(job)
 
 
 def summary(results: list[dict[str, dict[str, Any]]]) -> dict[str, dict[str, Any]]:
-    """Of each filter over several recordings: sums of frames and teleports, medians of the rest."""
+    """Figures of each filter over several recordings: sums of frames and teleports, medians of the rest."""
     found: dict[str, dict[str, Any]] = {}
     for name in FILTERS:
         own = [each[name] for each in results]
@@ -230,7 +231,7 @@ def summary(results: list[dict[str, dict[str, Any]]]) -> dict[str, dict[str, Any
 
 
 def main() -> int:
-    """The benchmark; 1 where an angle teleports."""
+    """The benchmark; exit code 1 if there are too many teleports."""
     parser = common.parser(__doc__, jobs=True, data=True)
     parser.add_argument("--parts", type=common.names, default=list(PARTS), help=f"which of {','.join(PARTS)}")
     parser.add_argument("--runs", type=int, default=40, metavar="N", help="simulated runs (default: %(default)s)")

@@ -1,10 +1,9 @@
 """The whole of Schlagenhauf (2017), chapter 5, as a baseline: calibrate, pair, fuse, filter. For others to import.
 
-As published, with its three errors (transposed rotation, weights, innovation) corrected and nothing else: one
-registration from the first 50 frames, in the T-pose (section 5.3.1); whatever each sensor said last, taken together
-when the first one speaks (section 5.2: two computers, no common clock); weights by the tracking states as her text
-has them (section 5.3.2); LKF1, LKF2 or her extended filter, as ``filters.thesis`` and ``filters.schlagenhauf`` have
-them.
+As published; only its three errors (transposed rotation, weights, innovation) are corrected. One registration from the
+first 50 frames, in the T-pose (section 5.3.1). The latest skeleton of each sensor is fused at each frame of the first
+sensor (section 5.2: two computers, no common clock). Weights by the tracking states as in her text (section 5.3.2).
+LKF1, LKF2 or her extended filter from ``filters.thesis`` and ``filters.schlagenhauf``.
 """
 
 from __future__ import annotations
@@ -38,16 +37,16 @@ def run_thesis(
     """Her pipeline (figure 5.1) over frames in the order of receipt.
 
     Returns:
-        Of each method one skeleton per frame of the first sensor, stamped by it, in ``world`` as this sensor, which
-        stands level, defines it.
+        For each method one skeleton per frame of the first sensor, with its stamp, in the ``world`` defined by this
+        sensor, which is assumed to stand level.
 
     Args:
         frames: of all sensors.
-        sensors: the first is the one that all others are brought together with.
+        sensors: the others are registered to the first one.
         methods: which of her filters to run.
 
     Raises:
-        CalibrationError: a sensor has less than 50 frames, or shows too little in them.
+        CalibrationError: a sensor has less than 50 frames, or too few tracked joints in them.
     """
     level = level_pose(sensors[0]).rotation
     registrations = {sensors[0]: (level, np.zeros(3))}
@@ -81,7 +80,7 @@ def _opening(frames: Sequence[RecordedFrame], sensor: str) -> tuple[FloatArray, 
 
 
 def _fused(seen: Sequence[tuple[Skeleton, FloatArray, FloatArray]]) -> Skeleton:
-    """Eq. 5.8 of skeletons, each with its rotation and translation into ``world``."""
+    """Fusion by eq. 5.8 of skeletons, each with its rotation and translation into ``world``."""
     states = np.stack([np.where(each.valid, each.states, 0) for each, _, _ in seen])
     weights = thesis_text(states)
     placed = np.stack([each.positions @ rotation.T + translation for each, rotation, translation in seen])

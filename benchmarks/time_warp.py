@@ -1,12 +1,12 @@
-"""Compare two recordings of one movement that share no clock.
+"""Compare two recordings of one movement without a common clock.
 
-Sensors that were not synchronised, and recordings that were cut separately, differ in where they start and, a little,
-in how fast their clocks ran. Classical dynamic time warping (Sakoe and Chiba 1978) is the wrong cure where errors are
-to be measured afterwards: it moves every single sample to where the values agree best, and so takes noise, lag and
+Sensors that were not synchronised, and recordings that were cut separately, differ in their starts and, slightly, in
+the rates of their clocks. Classical dynamic time warping (Sakoe and Chiba 1978) is unsuitable if errors are to be
+measured afterwards: it moves every single sample to where the values agree best, and so takes noise, lag and
 differences of amplitude for differences of time (its "singularities": Keogh and Pazzani 2001). The warp here is smooth
-and has few degrees of freedom, as in curve registration (Ramsay and Li 1998), and its criterion is the share of
-variance left over after each feature was given an offset and a gain of its own. Hence it is blind to bias and scale,
-which are what the comparison is to measure, and it has too few parameters to follow noise.
+and has few degrees of freedom, as in curve registration (Ramsay and Li 1998). Its criterion is the share of variance
+left after a regression of each feature with its own offset and gain. Hence it is blind to bias and scale, which the
+comparison is to measure, and it has too few parameters to follow noise.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from body_tracking.core.skeleton import FloatArray
 from body_tracking.evaluation.metrics import sample
 
 INTERVALS = 4
-"""Of linearly changing rate; one more than this are the degrees of freedom besides the offset."""
+"""Number of intervals with a linearly changing rate; the warp has one more rate than this, and an offset."""
 RATES = (0.6, 1.7)
-"""Least and most overall rate (reference seconds per second) that the search tries."""
+"""Smallest and largest overall rate (reference seconds per second) in the search."""
 LEAST_OVERLAP = 0.6
-"""Share of the samples that must fall into the reference."""
+"""Smallest share of the samples that must fall into the reference."""
 BEND, DRIFT = 0.02, 0.02
-"""Cost of a change of the log rate by 1 over one interval, and of a mean log rate of 1 (clocks
-are nominally right), in shares of the variance."""
+"""Cost of a change of the log rate by 1 over one interval, and of a mean log rate of 1 (clocks are nominally right),
+as shares of the variance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,11 +37,11 @@ class TimeWarp:
 
     Attributes:
         knots: (k,) s, in the recording's own time.
-        values: (k,) s, the reference's time at the knots; beyond its end in a later period where ``period`` is given.
+        values: (k,) s, the reference's time at the knots; with a ``period`` it may be in a later cycle.
         rates: (k,) > 0, derivative at the knots, linear in between.
         span: (first, last) time of the reference, s.
-        period: s by which the reference repeats itself, or None.
-        explained: share of the features' variance that the aligned reference explains, 0 to 1.
+        period: of the reference, s, or None.
+        explained: share of the features' variance explained by the aligned reference, 0 to 1.
     """
 
     knots: FloatArray
@@ -52,12 +52,12 @@ class TimeWarp:
     explained: float = float("nan")
 
     def __call__(self, times: FloatArray) -> FloatArray:
-        """(n,) times of the recording, s, to (n,) times of the reference; NaN where it has none."""
-        # a cubic with the values and slopes of a parabola is that parabola
+        """(n,) times of the recording, s, to (n,) times of the reference; NaN outside the reference."""
+        # a cubic with the values and slopes of a parabola equals that parabola
         at: FloatArray = CubicHermiteSpline(self.knots, self.values, self.rates)(times)
         first, last = self.span
         if self.period is not None:
-            # where the cycle is a little longer than what was recorded of it, its end stands for the rest
+            # if the cycle is a little longer than its recording, use the recording's end for the rest
             return np.minimum(first + np.mod(at - first, self.period), last)
         return np.where((at >= first) & (at <= last), at, np.nan)
 
@@ -67,12 +67,12 @@ class Agreement:
     """How one series agrees with another.
 
     Attributes:
-        samples: how many were compared.
-        correlation: Pearson's, NaN where one of the series is constant.
+        samples: number of compared samples.
+        correlation: Pearson's, NaN if one of the series is constant.
         bias: mean of estimate minus reference, in the series' unit.
         rms: root mean square of the difference.
-        debiased_rms: the same after the bias was taken off.
-        gain: slope of the estimate over the reference (least squares), NaN where the reference is constant.
+        debiased_rms: the same without the bias.
+        gain: slope of the estimate over the reference (least squares), NaN if the reference is constant.
     """
 
     samples: int
@@ -112,20 +112,20 @@ def estimate_warp(
 ) -> TimeWarp:
     """The warp under which the reference explains most of the features' variance.
 
-    Minimises ``1 - R^2 + BEND * sum (change of log rate)^2 + DRIFT * (mean log rate)^2``, with ``R^2`` pooled over the
-    features after a regression of each on its aligned reference (offset free, gain not negative), first over a grid of
-    straight lines, then from the best of these over all parameters (Nelder and Mead 1965).
+    Minimises ``1 - R^2 + BEND * sum (change of log rate)^2 + DRIFT * (mean log rate)^2``. ``R^2`` is pooled over the
+    features after a regression of each on its aligned reference (offset free, gain not negative). The search begins
+    with a grid of straight lines; the best of these starts an optimisation of all parameters (Nelder and Mead 1965).
 
     Args:
         times: (n,) increasing, s.
         features: (n, f), in units that make the f comparable, such as the components of unit vectors.
         reference_times: (m,) increasing, s.
         reference_features: (m, f).
-        period: where the reference is one cycle of a movement that repeats, its length in s: it is continued
-            periodically, and all samples overlap.
+        period: length of the reference in s if it is one cycle of a periodic movement: it is continued periodically,
+            and all samples overlap.
 
     Raises:
-        ValueError: no overlap that is long enough.
+        ValueError: no shift gives enough overlap.
     """
     span = (float(reference_times[0]), float(reference_times[-1]))
     knots = np.linspace(times[0], times[-1], INTERVALS + 1)

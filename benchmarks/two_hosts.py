@@ -1,14 +1,14 @@
 """Two Kinects on one computer, the graph on another, and a bad network between them: angles, stamps and recovery.
 
-A person is simulated before two Kinects. ``kinect_sender --replay`` streams each of them from a host of its own to a
-host with the graph of ``body_tracking up``, through a relay that loses packets, holds each of them up for another time,
-and cuts the link for a while. The hosts are network namespaces, the senders' clock is shifted by a time namespace:
-this needs root, or a system that lets users make namespaces. The graph starts with the true poses of the sensors.
+A simulated person stands in front of two Kinects. ``kinect_sender --replay`` streams both from one host to another with
+the graph of ``body_tracking up``, through a relay that loses packets, delays each of them differently, and cuts the
+link for a while. The hosts are network namespaces, a time namespace shifts the senders' clock: this needs root, or a
+system with user namespaces. The graph starts with the true poses of the sensors.
 
-The angles are compared with those that the same chain makes offline of the whole recording, and of the frames that
-came, which shows what the loss alone does; not where a standard deviation exceeds 15 degrees, nor from the beginning of
-the cut until a second after its end. Errors of stamps are counted less their median: no receiver can know the delay of
-the fastest frame.
+The angles are compared with those of the same chain offline, from the whole recording, and from the received frames;
+the latter shows the effect of the loss alone. Left out are angles with a standard deviation above 15 degrees, and the
+time from the start of the cut to a second after its end. Errors of stamps are counted without their median: no receiver
+can know the delay of the fastest frame.
 """
 
 from __future__ import annotations
@@ -49,16 +49,16 @@ from body_tracking.simulation.layouts import around
 from body_tracking.simulation.scene import RECEIVED_FROM_NS, Setup, SimulatedRecording
 
 SETTLE = 4.0
-"""Seconds in which person and noise become known; what is compared comes after."""
+"""Seconds of initialisation of person and noise, before the comparison."""
 
 LEAD, LEAD_FACTOR = 2.0, 3.0
-"""Seconds until the recording begins once the graph is there, and so many times what a sender takes to start."""
+"""Seconds from the start of the graph to that of the recording, plus this multiple of a sender's start time."""
 READY_TIMEOUT = 180.0
 
 WORST_STDDEV = np.radians(15.0)
 LIMITS = {"angle_deg": 0.5, "all_angles_deg": 0.25, "recovery_s": 1.0}
 NO_NAMESPACES = 77
-"""The exit code where the system does not permit them."""
+"""Exit code where the system does not permit namespaces."""
 
 _SEED = 11
 _LAYOUT = around(np.radians([45.0, -45.0]).tolist(), (2.0, 2.0), (1.0, 1.0))
@@ -67,7 +67,7 @@ _PORT = 7525
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """Probability of loss, seconds of delay at most, wall times between which nothing passes."""
+    """Probability of loss, largest delay in seconds, and wall times of the start and the end of the cut."""
 
     loss: float
     jitter: float
@@ -76,7 +76,7 @@ class Link:
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """Seconds to compare before and after the cut, of the cut, between the clocks; the link; the filter; a folder."""
+    """Seconds compared before and after the cut, of the cut, and between the clocks; link, filter, and a folder."""
 
     seconds: float
     cut: float
@@ -90,7 +90,7 @@ class Options:
 
 
 def simulate(seconds: float, folder: Path) -> SimulatedRecording:
-    """The recording as a bag in a folder, and its calibration in two files; in both stamps are ROS time."""
+    """Write the recording as a bag, and its calibration as two files: for recorded stamps and for ROS time."""
     recording = scene.simulate(Setup("torso_twist", _LAYOUT, seconds=seconds, seed=_SEED, standard=True))
     write_bag(recording, folder / "bag")
     poses = {sensor.pose.sensor: sensor.pose for sensor in recording.sensors}
@@ -101,7 +101,7 @@ def simulate(seconds: float, folder: Path) -> SimulatedRecording:
 
 
 def captures(recording: SimulatedRecording) -> dict[str, FloatArray]:
-    """Of each sensor (n, 3) integer nanoseconds: stamp of a frame, its capture in reference time, its receipt."""
+    """Per sensor (n, 3) integer nanoseconds: stamp of a frame, its capture in reference time, its receipt."""
     clocks = {sensor.pose.sensor: sensor.clock for sensor in recording.sensors}
     found: dict[str, list[tuple[int, int, int]]] = {name: [] for name in clocks}
     for frame in recording.frames:
@@ -115,7 +115,7 @@ def captures(recording: SimulatedRecording) -> dict[str, FloatArray]:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """When the recording began, the link with its cut, how often a node was started again, how the senders ended."""
+    """Wall time of the recording's start, link with its cut, number of node restarts, exit codes of the senders."""
 
     start: float
     link: Link
@@ -124,7 +124,7 @@ class Run:
 
 
 def run(recording: SimulatedRecording, folder: Path, options: Options) -> Run:
-    """Stream the recording."""
+    """Stream the recording through the graph."""
     link, before = options.link, SETTLE + options.seconds
     names = [sensor.pose.sensor for sensor in recording.sensors]
     key = folder / "key"
@@ -149,7 +149,7 @@ def run(recording: SimulatedRecording, folder: Path, options: Options) -> Run:
 
         middleman = begin("relay", [*middle, *hosts.command("relay", link.loss, link.jitter, *ports.values())])
         graph_process = begin("up", up)
-        # The sensors' nodes come last, when everybody listens to whom they should.
+        # the sensors' nodes start last: all subscribers are up by then
         ports_open = [f":{port:04X}" for port in ports.values()]
         live.wait(
             "two_hosts: the graph",
@@ -176,7 +176,7 @@ def run(recording: SimulatedRecording, folder: Path, options: Options) -> Run:
     return Run(start, link, (folder / "up.log").read_text().count("starting it again"), codes)
 
 
-# --- what came of it
+# --- evaluation
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -190,7 +190,7 @@ class Angles:
     stddevs: FloatArray
 
     def at(self, stamps: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Angles and standard deviations between the samples."""
+        """Angles and standard deviations, linearly interpolated."""
         unwrapped = np.unwrap(self.values, axis=0)
         columns = range(len(self.names))
         return (
@@ -225,9 +225,9 @@ def read_angles(bag: Path) -> Angles:
 
 
 def match(recording: SimulatedRecording, live: Path) -> dict[str, FloatArray]:
-    """Of each sensor (m, 3): index of a recorded frame that came, its stamp there, its receipt there; ns.
+    """Per sensor (m, 3): index of a received frame in the recording, its stamp in the live bag, its receipt; ns.
 
-    A frame is known by its coordinates, which come through the network to the bit.
+    A frame is identified by its coordinates, which the network keeps to the bit.
     """
     known = {name: {} for name in captures(recording)}
     count = dict.fromkeys(known, 0)
@@ -246,7 +246,7 @@ def match(recording: SimulatedRecording, live: Path) -> dict[str, FloatArray]:
 
 
 def without_lost(folder: Path, came: Mapping[str, FloatArray]) -> Path:
-    """The recording without the frames that did not come."""
+    """The recording with the received frames only."""
     out = folder / "came"
     topics = {graph.skeleton_topic(name): set(rows[:, 0].tolist()) for name, rows in came.items()}
     count = dict.fromkeys(topics, 0)
@@ -261,7 +261,7 @@ def without_lost(folder: Path, came: Mapping[str, FloatArray]) -> Path:
 
 
 def offline(folder: Path, bag: Path, out: Path, name: str) -> Angles:
-    """What the chain makes of a recording."""
+    """Angles of the chain from a recording, offline."""
     calibration = folder / f"{out.name}.yaml"
     shutil.copy(folder / "recorded.yaml", calibration)
     command = [sys.executable, "-m", "body_tracking.cli", "replay", str(bag), "-o", str(out), "--filter", name]
@@ -270,7 +270,7 @@ def offline(folder: Path, bag: Path, out: Path, name: str) -> Angles:
 
 
 def measure(options: Options) -> dict[str, Any]:
-    """Everything once."""
+    """Run the benchmark once."""
     with contextlib.ExitStack() as stack:
         folder = options.keep or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="two_hosts_")))
         folder.mkdir(parents=True, exist_ok=True)
@@ -303,7 +303,7 @@ def measure(options: Options) -> dict[str, Any]:
         delivered = truth[sensor][:, 2] + begun
         in_cut = (delivered >= link.cut[0] * NANOSECONDS) & (delivered < link.cut[1] * NANOSECONDS)
         lost = len(delivered) - len(rows) - int(in_cut.sum())
-        # in wall time: captured so long before delivery as by the reference sensor's clock, which runs as the wall does
+        # capture in wall time: as long before delivery as by the reference sensor's clock, which has the wall's rate
         errors = (rows[:, 1] - (truth[sensor][rows[:, 0], 1] + begun)) / 1e6
         steady = delivered[rows[:, 0]] > (start + SETTLE) * NANOSECONDS
         errors = errors[steady] - np.median(errors[steady])
@@ -311,7 +311,7 @@ def measure(options: Options) -> dict[str, Any]:
         result["sensors"][sensor] = {
             "recorded": len(delivered),
             "received": len(rows),
-            # a sender on a busy machine leaves out what is late by half a second
+            # a sender on a busy machine drops frames that are late by half a second
             "not_sent": max(0, len(delivered) - len(rows) - int(values[f"{sensor}_skeleton"].get("lost", 0))),
             "lost_percent": round(100.0 * lost / max(1, int((~in_cut).sum())), 2),
             "stamp_rms_ms": round(float(np.sqrt((errors**2).mean())), 3),
@@ -325,7 +325,7 @@ def measure(options: Options) -> dict[str, Any]:
             },
         }
     rows = came[reference]
-    # ROS time of the recording and of this machine, by the frames that have both
+    # map this machine's ROS time to the recording's, by the frames with both stamps
     slope, base = np.polyfit((rows[:, 1] - rows[0, 1]) / NANOSECONDS, recorded[rows[:, 0]] - rows[:, 1], 1)
     stamps = live.stamps + base + slope * (live.stamps - rows[0, 1]) / NANOSECONDS
     result["angles"] = compare(live, stamps, whole, lossy, start, link)
@@ -366,9 +366,9 @@ def compare(live: Angles, stamps: FloatArray, whole: Angles, lossy: Angles, star
 
 
 def recovery(received: FloatArray, wall: FloatArray, apart: FloatArray, start: float, link: Link) -> dict[str, Any]:
-    """Seconds from the end of the cut until the first angles, and until half a second of them is as before the cut.
+    """Seconds from the end of the cut to the first angles, and to the first half second as good as before the cut.
 
-    As before: together as near to what they should be as 99 of 100 half seconds were before it, or within a degree.
+    The limit is the 99th percentile of the half seconds' RMS differences before the cut, at least a degree.
     """
 
     def half_second(at: float) -> float:
@@ -391,7 +391,7 @@ def _rms(values: FloatArray) -> float:
 
 
 def last_values(bag: Path) -> dict[str, dict[str, str]]:
-    """What each node said last in its diagnostics."""
+    """Values of each node's last diagnostics."""
     found = {}
     with BagReader(bag) as reader:
         for raw in reader.messages([graph.DIAGNOSTICS_TOPIC]):
@@ -404,7 +404,7 @@ def last_values(bag: Path) -> dict[str, dict[str, str]]:
 
 
 def bars(result: dict[str, Any]) -> dict[str, bool]:
-    """Which are met."""
+    """Whether each bar is met."""
     angles, sensors = result["angles"], result["sensors"].values()
     met = {
         "every angle as from the recording within the loss": all(
@@ -447,13 +447,13 @@ def main() -> int:
 
 
 def _inside() -> int:
-    """The same command in a network namespace of its own: the host of the graph."""
+    """Run the same command in its own network namespace, which is the host of the graph."""
     reason = hosts.not_permitted()
     if reason:
         common.progress(f"two_hosts: network and time namespaces are not permitted here ({reason})")
         return NO_NAMESPACES
     command = hosts.in_own_network([sys.executable, __file__, "--inside", *sys.argv[1:]])
-    process = subprocess.Popen(command)  # in the ROS domain that `live` has chosen
+    process = subprocess.Popen(command)  # in the ROS domain chosen by `live`
     try:
         return process.wait()
     except KeyboardInterrupt:

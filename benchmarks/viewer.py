@@ -1,11 +1,11 @@
-"""What the viewer costs the graph: the delay from capture to joint angles with it, beside the delay without it.
+"""Cost of the viewer for the graph: the delay from capture to joint angles with it, beside the delay without it.
 
-The graph of benchmarks/latency.py with two sensors of 30 Hz runs all the time. Stretches in which no viewer runs
-alternate with stretches in which the viewer runs, in a session of its own, and a real browser (headless Chromium) shows
-it. Delays are from just before a frame is published until its angles are received, by one clock, in one process.
+The graph of benchmarks/latency.py with two sensors of 30 Hz runs all the time. Stretches without a viewer alternate
+with stretches in which the viewer runs, in its own session, and a real browser (headless Chromium) shows it. Delays are
+from just before a frame is published until its angles are received, by one clock, in one process.
 
-The browser has no graphics card here and draws in software. So it draws few pixels (``--sharpness``) and yields to
-everybody else; ``cpu_percent`` says how much of a processor it still took.
+The browser has no graphics card here and renders in software. So it renders few pixels (``--sharpness``) at the lowest
+priority; ``cpu_percent`` is the share of a processor that it still used.
 """
 
 from __future__ import annotations
@@ -40,17 +40,17 @@ SETTLE = 2.0
 
 
 def yields() -> None:
-    """In a process that is to draw whenever nobody else has anything to do."""
+    """Give this process its own session and the lowest priority."""
     os.setsid()
     os.nice(19)
-    # where the scheduler shares by session (sched(7)), niceness counts only within one
+    # where the scheduler groups by session (sched(7)), niceness counts only within one
     with contextlib.suppress(OSError):
         Path("/proc/self/autogroup").write_text("19", encoding="ascii")
 
 
 @contextlib.contextmanager
 def chromium(folder: Path) -> Iterator[Any]:
-    """A browser that stays, and yields to everybody; its first page shows nothing."""
+    """A persistent browser at the lowest priority; its first page is blank."""
     path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if path is None:
         raise SystemExit("viewer: no chromium here: apt-get install chromium")
@@ -76,7 +76,7 @@ def chromium(folder: Path) -> Iterator[Any]:
 
 @contextlib.contextmanager
 def viewer(page: Any, folder: Path, sharpness: float) -> Iterator[psutil.Process]:
-    """The viewer, shown by the browser: it draws."""
+    """The viewer, shown and drawn by the browser."""
     log = folder / "viewer.log"
     command = [sys.executable, "-m", "body_tracking.nodes", "viewer", "--ros-args", "-p", "port:=0"]
     with live.processes([command], log) as running:
@@ -92,7 +92,7 @@ def viewer(page: Any, folder: Path, sharpness: float) -> Iterator[psutil.Process
 
 
 def measure(seconds: float, pairs: int, sharpness: float) -> dict[str, Any]:
-    """Alternate, and compare."""
+    """Alternate stretches without and with the viewer, and compare their delays."""
     streams, poses = latency.recorded()
     bench = latency.bench_of_graph("viewer_bench")
     ended = threading.Event()
