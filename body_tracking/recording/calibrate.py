@@ -23,7 +23,7 @@ from body_tracking.recording.rig import RigReader
 from body_tracking.systems import all_nodes_for, nodes_for, options_of
 
 HISTORY_S = 600.0
-"""Raw frames kept, seconds: a recording up to this long is interpolated again with the final clock."""
+"""Seconds of raw frames kept: a recording up to this length is interpolated again with the final clock."""
 
 
 def relative_yaw(result: CalibrationResult, sensor: str) -> float:

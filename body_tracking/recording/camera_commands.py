@@ -16,11 +16,11 @@ from body_tracking.camera.pose_model import Landmarks, PoseModel
 from body_tracking.core.errors import BodyTrackingError
 
 _ROUNDS: Final = 3
-"""Searches of a region in a single image, each from where the last one ended, as in a video."""
+"""Number of searches in a single image, each in the region of the previous result, as in a video."""
 
 
 class CameraCommandError(BodyTrackingError):
-    """An image cannot be read or written."""
+    """Raised when an image cannot be read or written."""
 
 
 def people_in(image: NDArray[np.uint8], model: PoseModel, people: int) -> list[Landmarks]:

@@ -15,7 +15,7 @@ SETUPS: Final[Mapping[str, Mapping[str, Value]]] = {
     "markers_arm": {"marker_setup": "config/marker_setup", "sensors": ()},
     "mesh_reaching": {"depth": ("kinect1",)},
 }
-"""Options of ``up`` that play those of the shipped recordings whose topics do not say how."""
+"""Options of ``up`` for those shipped recordings whose topics do not determine them."""
 
 
 def is_bag(path: Path) -> bool:
@@ -24,14 +24,14 @@ def is_bag(path: Path) -> bool:
 
 
 def bags_in(folder: Path) -> tuple[Path, ...]:
-    """The recordings of a folder, the folder itself where it is one, and those of its folder ``bags``; newest first."""
+    """The folder itself if it is a recording; else those in it and in its folder ``bags``, newest first."""
     try:
         if is_bag(folder):
             return (folder,)
         found = [each for place in (folder, folder / "bags") if place.is_dir() for each in place.iterdir()]
         found = [each for each in found if is_bag(each)]
         return tuple(sorted(found, key=lambda each: (-each.stat().st_mtime, each.name)))
-    except OSError:  # a folder that may not be read, or a bag that is gone meanwhile
+    except OSError:  # no permission to read a folder, or a bag was deleted meanwhile
         return ()
 
 
@@ -58,5 +58,5 @@ def _shipped() -> Path | None:
 
 
 def _rank(bag: Path) -> tuple[bool, str]:
-    """Those of skeletons first, for which nothing else is needed."""
+    """Sort key: recordings of skeletons first, which need no options."""
     return not bag.name.startswith("tpose"), bag.name

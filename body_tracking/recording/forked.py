@@ -1,4 +1,4 @@
-"""The second half of the offline graph in processes of its own: one filters, one computes angles and writes the bag.
+"""The second half of the offline graph in its own processes: one filters, one computes angles and writes the bag.
 
 With ``ekf`` the filter takes as long as all the rest; the results are the same as in one process.
 """
@@ -28,7 +28,7 @@ from body_tracking.recording.rosbag2 import BAG_WIRE, BagError, BagWriter, remov
 from body_tracking.systems import NODES, stage_class
 
 _BATCH = 128
-"""Messages per batch through the pipe, where each batch costs as much as several messages."""
+"""Messages per batch through the pipe: a batch by itself costs as much as several messages."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,11 +69,11 @@ def is_second(executable: str) -> bool:
 
 
 class Downstream:
-    """Runs the second half: the filter in this process, and :class:`Last` where ``follow`` makes it.
+    """Runs the second half: the filter in this process, the stages after it by ``follow``.
 
     Args:
         job: of the second half.
-        follow: makes what runs the stages after the filter, and writes; here where None.
+        follow: constructs the runner of the stages after the filter, which writes the bag; None for :class:`Last`.
 
     Raises:
         BodyTrackingError: ``out`` cannot be written, or invalid parameters.
@@ -169,11 +169,11 @@ def _counters(stages: Sequence[Stage], runner: OfflineRunner) -> dict[str, int]:
 
 
 class ForkedDownstream:
-    """:class:`Downstream` in a process of its own, with the filter's process as its child; errors as there.
+    """:class:`Downstream` in its own process, with a child process for :class:`Last`; errors as of :class:`Downstream`.
 
     Args:
         job: of the second half.
-        last: run :class:`Last` alone; else its process is a child of this one's.
+        last: the process runs only :class:`Last`.
     """
 
     def __init__(self, job: Job, *, last: bool = False) -> None:
@@ -219,7 +219,7 @@ class ForkedDownstream:
             remove_file(self.path)  # still there where the other process was killed
 
     def _send(self) -> None:
-        if self._error is not None:  # raised before, where a runner took it for one of its stages'
+        if self._error is not None:  # raised before, but a runner took it for an error of its stages
             raise self._error
         try:
             self._connection.send(self._batch)
@@ -241,7 +241,7 @@ class ForkedDownstream:
 
 
 def _serve(inherited: Connection, connection: Connection, job: Job, last: bool) -> None:
-    """The other process."""
+    """Main function of the other process."""
     # With this copy of the first process's end open, recv() would not notice that it was closed there.
     inherited.close()
     # Inherited garbage must not be collected here: ROS nodes, whose threads do not exist in this process, would crash.

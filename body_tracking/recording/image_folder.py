@@ -5,10 +5,11 @@
     FOLDER/rgb/ (or color/)   JPEG or PNG files
     FOLDER/depth/             PNG files of 16 bits, registered to the colour images; may be absent
     FOLDER/camera_info.yaml   intrinsics of the colour images, as ROS's camera_calibration writes them
-    FOLDER/depth_info.yaml    of the depth images, where these are not those of the colour images by their size
+    FOLDER/depth_info.yaml    of the depth images; default: those of the colour images at the depth images' size
 
-A file's name is its stamp in seconds where it has a decimal point (``1305031102.175304.png``, as in the RGB-D benchmark
-of the TU Munich); other files are numbered through at a given rate. Files go into the bag as they are.
+A file name with a decimal point is the stamp in seconds (``1305031102.175304.png``, as in the RGB-D benchmark of the TU
+Munich); other files are numbered at a given rate. Colour files go into the bag unchanged, depth images are encoded
+again in millimetres.
 """
 
 from __future__ import annotations
@@ -41,21 +42,21 @@ from body_tracking.recording.rosbag2 import BAG_WIRE, BagWriter
 COLOUR_FOLDERS: Final = ("rgb", "color", "colour")
 _SUFFIXES: Final = (".png", ".jpg", ".jpeg")
 _MARKS: Final = {"png": (b"\x89PNG\r\n\x1a\n", b"IEND"), "jpeg": (b"\xff\xd8", b"\xff\xd9")}
-"""How the data of an image begin, and what is near their end."""
+"""First bytes of an image file, and bytes near its end."""
 _MILLIMETRES: Final = 1000.0
 _TAIL: Final = 4096
-"""Bytes: some cameras append their own after an image."""
+"""Bytes at the end of a file that may contain the end mark: some cameras append their own data to an image."""
 _LARGEST: Final = 64 << 20
-"""Bytes of an image file."""
+"""Limit of an image file's size, bytes."""
 
 
 class ImageFolderError(BodyTrackingError):
-    """The folder has no images, no intrinsics, or a file of it cannot be used; the text names it."""
+    """Raised when a folder has no images or no intrinsics, or a file cannot be used; the text names it."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImportedImages:
-    """What was written.
+    """Result of an import of images.
 
     Attributes:
         bag: the folder.
@@ -71,12 +72,12 @@ class ImportedImages:
     recording_s: float
 
     def text(self) -> str:
-        """One line."""
+        """The result as one line."""
         images = f"{self.colour} colour and {self.depth} depth images of {self.camera}"
         return f"{self.bag}: {images}, {self.recording_s:.1f} s"
 
     def as_json(self) -> str:
-        """One JSON object."""
+        """The result as one JSON object."""
         return json.dumps(asdict(self) | {"bag": str(self.bag)}, indent=2)
 
 
@@ -91,15 +92,15 @@ def import_folder(
     """Write the images of a folder as a bag.
 
     Args:
-        folder: the images.
-        bag_folder: to be written.
+        folder: of the images.
+        bag_folder: the bag to write.
         camera: the sensor's name.
-        rate: images a second, where the files' names are no stamps.
-        depth_scale: of a depth image's numbers to a metre.
-        overwrite: replace a bag that is there.
+        rate: of images without stamps as names, Hz.
+        depth_scale: pixel values per metre in the depth images.
+        overwrite: replace an existing bag.
 
     Raises:
-        ImageFolderError: see there; no bag is left then.
+        ImageFolderError: the folder or a file cannot be imported; the incomplete bag is removed.
         SensorNameError: an invalid name.
         BagError: the bag cannot be written.
     """
@@ -147,7 +148,7 @@ def import_folder(
 
 
 def _stamped(folder: Path, rate: float) -> dict[int, Path]:
-    """The images of a folder by their stamps in nanoseconds, in order; empty where there is none."""
+    """Image files of a folder by stamp, nanoseconds, in order; empty without the folder."""
     if not folder.is_dir():
         return {}
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES and path.is_file())
@@ -201,7 +202,7 @@ def _numbers(content: Mapping[str, Any], key: str) -> Any:
 
 
 def _depth_info(folder: Path, colour: Camera, first: Path) -> Camera:
-    """Intrinsics of the depth images: of a file, or those of the colour images at the size of the first one."""
+    """Intrinsics of the depth images: of a file, or of the colour images at the first depth image's size."""
     path = folder / "depth_info.yaml"
     if path.is_file():
         return _read_info(path, colour.frame_id)
@@ -209,7 +210,7 @@ def _depth_info(folder: Path, colour: Camera, first: Path) -> Camera:
     scale = np.array([width / colour.width, height / colour.height])
     matrix = colour.matrix.copy()
     matrix[[0, 1], [0, 1]] *= scale
-    # pixels count from the centre of the first one
+    # pixel coordinates count from the centre of the first pixel
     matrix[:2, 2] = (matrix[:2, 2] + 0.5) * scale - 0.5
     return replace(colour, width=width, height=height, matrix=matrix)
 
@@ -224,7 +225,7 @@ def _data(path: Path) -> bytes:
 
 
 def _form(path: Path, data: bytes) -> str:
-    """The format of a whole image, by its data: a name may have the suffix of the other one."""
+    """The format of a complete image, by its data: the name may have another format's suffix."""
     form = next((each for each, (begin, _) in _MARKS.items() if data.startswith(begin)), None)
     if form is None:
         raise ImageFolderError(f"{path}: {'no PNG or JPEG image' if data else 'the file is empty'}")
@@ -234,7 +235,7 @@ def _form(path: Path, data: bytes) -> str:
 
 
 def _decoded(path: Path, data: bytes) -> Any:
-    _form(path, data)  # of what is cut off, OpenCV would write a line of its own
+    _form(path, data)  # OpenCV would print a warning about a truncated image
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 2:
         raise ImageFolderError(f"{path}: no PNG image of 16 bits and one channel")

@@ -64,7 +64,7 @@ SUFFIXES = (*CSV_SUFFIXES, NTU_SUFFIX, *MVNX_SUFFIXES, C3D_SUFFIX)
 _Item = RecordedFrame | RecordedImu | RecordedAngles | RecordedPoints | RecordedDepth | RecordedMarkers
 _Recording = Recording[_Item]
 _Message = tuple[str, str, Qos, object]
-"""Topic, its type and quality, message."""
+"""Topic, message type, QoS, message."""
 
 
 class ImportFileError(BodyTrackingError):
@@ -77,9 +77,9 @@ class ImportedSensor:
 
     Attributes:
         frames: number of messages.
-        bodies: the most bodies in one frame; 0 for an inertial sensor and for points.
-        start_ns, end_ns: first and last receipt.
-        topics: of the messages, in the order of their first ones.
+        bodies: largest number of bodies in a frame; 0 for an inertial sensor and for points.
+        start_ns, end_ns: time of the first and the last receipt.
+        topics: in the order of their first messages.
     """
 
     start_ns: int
@@ -113,11 +113,11 @@ class ImportReport:
 
     @property
     def frames(self) -> int:
-        """Messages of all sensors."""
+        """Number of messages of all sensors."""
         return sum(sensor.frames for sensor in self.sensors.values())
 
     def as_json(self) -> str:
-        """One JSON object."""
+        """The report as one JSON object."""
         sensors = {
             name: {"frames": each.frames, "bodies": each.bodies, "seconds": each.seconds, "topics": list(each.topics)}
             for name, each in self.sensors.items()
@@ -147,7 +147,7 @@ def open_recording(path: Path, sensor: str | None = None, partial: bool = False)
 
 
 def _open_any(path: Path, name: str | None, partial: bool, labels: Sequence[str], noise: float) -> _Recording:
-    """The reader for a file of skeletons, of inertial readings or of points, or for a folder with all of them."""
+    """The reader for a file of skeletons, inertial readings or points, or for a folder of NTU's motion capture data."""
     if is_ntu_mocap(path):
         return NtuMocapRecording(path, name, partial)
     _check_kind(path)
@@ -165,7 +165,7 @@ def _open_any(path: Path, name: str | None, partial: bool, labels: Sequence[str]
 
 
 def _check_kind(path: Path) -> None:
-    """Raise where a path is nothing that can be imported, by its name and kind."""
+    """Reject a path that cannot be imported, by its name and kind."""
     if path.suffix == BAG_SUFFIX or (path.is_dir() and any(path.glob(f"*{BAG_SUFFIX}"))):
         raise ImportFileError(f"{path}: a bag, which needs no import")
     if path.is_dir():
@@ -204,7 +204,7 @@ def import_files(
         bag: the folder to create.
         sensors: names by file, for files that lack the sensor's name or to replace it. By default CSV files without the
             column ``sensor`` are ``kinect1``, ``kinect2``, ...
-        labels: of the points of another motion capture system that are imported; all when empty.
+        labels: of the points to import from another motion capture system; all when empty.
         noise: standard deviation of each coordinate of these points, metres.
         overwrite: replace an existing bag.
         partial: import truncated files up to their last whole frame.

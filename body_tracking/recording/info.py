@@ -153,11 +153,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _recovered(folder: Path) -> list[str]:
-    """Close a bag, and return what was missing in it; a bag of which nothing is missing is left as it is."""
+    """Close a bag unless nothing is missing; returns the warnings about missing or damaged parts."""
     try:
         before = bag_info(folder).warnings
     except BagError as error:
         before = [str(error)]
-    if before or not folder.is_dir():  # which recover refuses
+    if before or not folder.is_dir():  # recover() rejects a file
         recover(folder).close()
     return before

@@ -47,12 +47,12 @@ from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, BagWriter
 
 _VIEWS = 600
-"""Of a labelled target; more hardly say more."""
+"""Approximate number of views of a labelled target: more views hardly add information."""
 _RENDER = "body_tracking.simulation.marker_bags"
 
 
 class MarkerCommandError(BodyTrackingError):
-    """A recording, an image or an option does not serve its purpose."""
+    """Raised when a recording, an image or an option cannot be used."""
 
 
 # --- recordings
@@ -60,17 +60,17 @@ class MarkerCommandError(BodyTrackingError):
 
 @dataclass(frozen=True, slots=True)
 class Tracked:
-    """What the stages made of a recording: messages by topic, and what they counted."""
+    """Output of the stages for a recording: messages by topic, and counters."""
 
     messages: Mapping[str, list[bytes]]
     counters: Mapping[str, int]
 
 
 def sources_of(bag: BagReader | RigReader, folder: Path) -> tuple[str, ...]:
-    """The topics of a recording from which everything else follows: of images, of balls, or of points.
+    """The source topics of a recording: of images, balls or points.
 
     Raises:
-        MarkerCommandError: none of them is there.
+        MarkerCommandError: the recording has none of them.
     """
     sources = setup.sources_in(folder)
     for topics in sources:
@@ -92,10 +92,10 @@ def track(
 
     Args:
         bag_path: with images, balls or points.
-        folder: the setup.
+        folder: of the setup.
         stages: in their order.
-        values: parameters of those that have them.
-        sink: gets topic, message and log time of everything that is taken from the recording or published.
+        values: parameters, for the stages that have them.
+        sink: called with topic, message and log time of each message from the recording and from the stages.
 
     Raises:
         BodyTrackingError: the recording or the setup cannot be used.
@@ -132,13 +132,13 @@ def track(
 
 
 def points_of(bag_path: Path, folder: Path, diameter: float) -> list[Points]:
-    """The points in a recording, frame by frame; diameter of the balls, metres, or 0."""
+    """The points in a recording, frame by frame; ``diameter`` of the balls in metres, or 0."""
     tracked = track(bag_path, folder, (DetectorStage, TriangulationStage), {"diameter": diameter})
     return [SpacePoints().decode(cdr, BAG_WIRE) for cdr in tracked.messages.get(setup.POINTS, ())]
 
 
 def poses_of(bag_path: Path, folder: Path, diameter: float) -> list[list[TargetPose]]:
-    """The poses of the targets in a recording, frame by frame; diameter of the balls, metres, or 0."""
+    """The poses of the targets in a recording, frame by frame; ``diameter`` of the balls in metres, or 0."""
     stages = (DetectorStage, TriangulationStage, TrackerStage)
     tracked = track(bag_path, folder, stages, {"deadline": 1.0, "diameter": diameter})
     frames: dict[int, list[TargetPose]] = {}
@@ -150,11 +150,11 @@ def poses_of(bag_path: Path, folder: Path, diameter: float) -> list[list[TargetP
 
 
 def fit_recording(bag_path: Path, folder: Path, joints: Sequence[JointDescription], diameter: float) -> ChainFit:
-    """The chain of a recording in which every joint moves.
+    """Fit the chain to a recording in which every joint moves.
 
     Args:
         bag_path: with images, balls or points.
-        folder: the setup, of which ``targets.yaml`` is read, and ``rig.yaml`` if it is there.
+        folder: of the setup, with ``targets.yaml``, and ``rig.yaml`` if there is one.
         joints: of the chain.
         diameter: of the balls, metres, or 0.
 

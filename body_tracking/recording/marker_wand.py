@@ -1,7 +1,7 @@
-"""``body_tracking markers wand``: the poses of two or more cameras, by a wand that is waved before them.
+"""``body_tracking markers wand``: the poses of two or more cameras, by a wand that is waved in front of them.
 
-The lenses come from a ``rig.yaml`` (``markers calibrate``), with their covariance. Cameras around a room, no two of
-which see a board together, are calibrated alone, each in a folder of its own, and put together here.
+The lenses come from a ``rig.yaml`` (``markers calibrate``), with their covariance. Cameras around a room that do not
+see a board together are calibrated separately, each in its own folder, and combined here.
 """
 
 from __future__ import annotations
@@ -35,23 +35,23 @@ from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BAG_WIRE
 
 _TOLERANCE_NS: Final = NANOSECONDS // 500
-"""By which the stamps of one set of images may differ, as in ``marker_triangulation``."""
+"""Largest difference of the stamps in one set of images, as in ``marker_triangulation``."""
 _VIEWS: Final = 500
-"""Places of the wand that are used by default: the adjustment takes 30 MB and 10 ms for each hundred, and camera."""
+"""Default number of wand places: the adjustment takes 30 MB and 10 ms per hundred places and camera."""
 
 
 class WandRecordingError(BodyTrackingError):
-    """A recording, a setup or an option does not serve to calibrate by a wand."""
+    """Raised when a recording, a setup or an option cannot be used to calibrate by a wand."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WandRecording:
-    """A wand as a recording shows it.
+    """Sightings of a wand in a recording.
 
     Attributes:
-        seen: the balls of the wand; views are sets of images in which two cameras or more see it.
-        images: (c,) number of images of each camera, and
-        recognised: (c,) those among them that show the wand.
+        seen: of the wand's balls; a view is a set of images in which two or more cameras see the wand.
+        images: (c,) number of images of each camera.
+        recognised: (c,) number of images with the wand.
     """
 
     seen: Sightings
@@ -60,11 +60,11 @@ class WandRecording:
 
 
 def read_lenses(folders: Sequence[Path]) -> tuple[tuple[Camera, ...], FloatArray]:
-    """Cameras of the ``rig.yaml`` of some folders, and (p, p) the covariance of their parameters, zeros for poses.
+    """Cameras from the ``rig.yaml`` of each folder, and the (p, p) covariance of their parameters, zero for poses.
 
     Raises:
         SetupError, RigFileError: a folder has none, or it cannot be read.
-        WandRecordingError: a camera is in two of them.
+        WandRecordingError: a camera is in two folders.
     """
     cameras: list[Camera] = []
     parts = []
@@ -86,12 +86,12 @@ def read_wand(path: Path, cameras: Sequence[Camera], wand: Wand, views: int = _V
         path: of the recording.
         cameras: that saw the wand, with their frames.
         wand: the wand.
-        views: places of the wand that are kept at most, evenly spread over the recording.
+        views: largest number of wand places, evenly spread over the recording.
 
     Raises:
         BagError: the recording cannot be read.
         WandRecordingError: it lacks a camera's images and balls.
-        WandError: balls of the wand at distances that give them no order.
+        WandError: the distances of the wand's balls do not determine their order.
     """
     frames = [camera.frame_id for camera in cameras]
     images, recognised = np.zeros(len(frames), dtype=int), np.zeros(len(frames), dtype=int)

@@ -79,7 +79,7 @@ class Block:
         start_ns: earliest log time in it.
         end_ns: latest log time in it.
         channels: of its messages; None if unknown before it is read.
-        count: of its messages; None likewise.
+        count: of its messages; None if unknown before it is read.
     """
 
     offset: int
@@ -97,7 +97,7 @@ def _parse(record: type[Any], content: bytes) -> Any:
 
 
 def _chunk_records(content: bytes, cut: bool) -> bytes:
-    """The records in a chunk; of a truncated one the first of them.
+    """The records in a chunk; of a truncated chunk the readable beginning.
 
     Raises:
         Damaged: the chunk is damaged or too large.
@@ -109,7 +109,7 @@ def _chunk_records(content: bytes, cut: bool) -> bytes:
     data = _decompress(chunk.compression, chunk.data, size + 1)  # one byte more, to detect a wrong size
     if not cut and len(data) != size:
         raise Damaged("its size does not fit")
-    # a chunk whose length is damaged seems to be cut, and may be whole
+    # a chunk with a damaged length looks truncated, but may be complete
     if len(data) == size and chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
         raise Damaged("its checksum does not fit")
     return data
@@ -371,7 +371,7 @@ class McapFile:
         return messages
 
     def _take_cut_chunk(self, position: int, size: int, stop: int) -> None:
-        """Read the chunk from ``position`` to ``stop``, in which the file ends at ``size``."""
+        """Read the truncated chunk from ``position`` to ``stop``; the file ends at ``size``."""
         before = max((block.end_ns for block in self.blocks), default=0)
         messages = self._take(Block(position, size - position, cut=True))
         missing = ""

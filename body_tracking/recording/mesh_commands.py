@@ -26,11 +26,11 @@ from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BAG_WIRE
 
 _SIDE: Final = 360
-"""Pixels of each side of a drawn image."""
+"""Side of a drawn image, pixels."""
 
 
 class MeshCommandError(BodyTrackingError):
-    """A recording does not serve its purpose."""
+    """Raised when a recording cannot be used."""
 
 
 def _messages(bag: RigReader, camera: str, *more: str) -> Iterator[tuple[str, bytes, int]]:
@@ -51,7 +51,7 @@ def personalise(bag_path: Path, camera: str, out: Path) -> str:
     """Estimate the shape of the person in a recording, as ``mesh_tracker`` does, and write it.
 
     Returns:
-        What was found.
+        A line about the estimated shape.
 
     Raises:
         MeshCommandError: no depth images, or too few different poses.
@@ -77,15 +77,15 @@ def personalise(bag_path: Path, camera: str, out: Path) -> str:
 
 
 def pictures(recording: Path, camera: str, count: int) -> list[NDArray[np.uint8]]:
-    """Depth images about the person, below them the same with the mesh over them, evenly spaced over a recording.
+    """Depth images of the person, evenly spaced over a recording; below each a copy with the mesh drawn over it.
 
     Args:
         recording: with depth images and the mesh.
         camera: its name.
-        count: at most so many.
+        count: largest number of images.
 
     Raises:
-        MeshCommandError: they are not in the recording.
+        MeshCommandError: depth images or meshes are missing.
     """
     info: Camera | None = None
     images: dict[int, bytes] = {}

@@ -1,4 +1,4 @@
-"""A percentage on stderr, where that is a terminal."""
+"""A percentage on stderr, if that is a terminal."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import sys
 
 
 class Progress:
-    """Shows how far a value is on its way from a start to an end.
+    """Shows the progress of a value from a start to an end.
 
     Args:
-        start: of the way, in any unit.
+        start: first value, in any unit.
         end: in the same unit.
     """
 

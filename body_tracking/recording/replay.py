@@ -53,7 +53,7 @@ class ReplayError(BodyTrackingError):
 
 
 OFFLINE: Final[Mapping[str, Value]] = {"deadline": 1.0}
-"""Limits of the time that a live graph has, seconds: offline they would make the results depend on the machine."""
+"""Time limits of the stages, seconds: with those of a live graph, offline results would depend on the machine."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +61,8 @@ class ReplaySettings:
     """Parameters of the offline graph; defaults as the nodes'.
 
     Attributes:
-        sensors: the first is the reference unless ``reference`` is set; all of the bag when empty, which may be none
-            with a ``marker_setup``; :data:`graph.NO_SENSORS` alone for none although the bag has some.
+        sensors: the first is the reference unless ``reference`` is set; all of the bag when empty, possibly none with a
+            ``marker_setup``; only :data:`graph.NO_SENSORS` for none although the bag has some.
         reference: or empty.
         filter_name: one of the filters.
         convention: of the joint angles; ``graph.AUTO`` for the filter's own.
@@ -222,7 +222,7 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
         if settings.calibration_file is not None:
             load(settings.calibration_file)  # raises if it is missing or invalid
         values = settings.values()
-        # before `out` is touched
+        # the stages may raise: construct them before `out` is replaced
         stages = [stage_class(name)(each) for name, each in values.items() if not forked.is_second(name)]
         written_by_us = {
             p.topic: (p.codec.type_name, p.qos) for stage in stages for p in stage.outputs if not p.optional
@@ -268,7 +268,7 @@ def _without(settings: ReplaySettings, bag: BagReader) -> bool:
     """Whether no skeletons of sensors are used.
 
     Raises:
-        ReplayError: none are wanted, and nothing else is.
+        ReplayError: neither skeletons nor other sources are selected.
     """
     if settings.sensors == (graph.NO_SENSORS,):
         if not settings.other_sources:
@@ -287,7 +287,7 @@ def _listed(counters: Mapping[str, int]) -> str:
 
 _OFFLINE_OPTIONS: Final = tuple(option.name for option in OPTIONS.values() if option.offline)
 _NAMED: Final = ("sensors", "filter", "convention", "calibration", "imus", "params_file", "model_covariance")
-"""Those that :class:`ReplaySettings` has by name."""
+"""Options that are attributes of :class:`ReplaySettings`."""
 
 
 def settings_from(args: argparse.Namespace) -> ReplaySettings:

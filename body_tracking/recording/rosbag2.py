@@ -135,7 +135,7 @@ class TopicInfo:
 
     @property
     def qos(self) -> Qos:
-        """The profile to publish it again."""
+        """QoS to publish it again."""
         return quality.offer_for(self.offered)
 
 
@@ -336,13 +336,13 @@ def _listed_in(folder: Path) -> list[Path] | None:
 
 
 def _refuse_unsupported(folder: Path) -> None:
-    """Raise where only ``metadata.yaml``, which is to be written anew, says how the messages are stored."""
+    """Reject an unsupported bag: its storage is stated only in ``metadata.yaml``, which would be overwritten."""
     try:
         _listed_in(folder)
     except UnsupportedBagError:
         raise
     except BagError:
-        pass  # missing, or no file of rosbag2
+        pass  # missing, or not rosbag2's
 
 
 def _natural(path: Path) -> tuple[str, int]:

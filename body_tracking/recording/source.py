@@ -33,8 +33,8 @@ class RecordingSource:
     """Plays one sensor of a recording (CSV, NTU RGB+D, bag) in real time.
 
     The recording's zero is the receipt of its first frame of any sensor, so that the sensors of one recording, each
-    played by a process of its own with the same ``start_time``, stay in step. A frame is stamped with the time at which
-    it plays minus its delay then (see :mod:`body_tracking.recording.stamps`); in a loop, stamps continue.
+    played by its own process with the same ``start_time``, stay in step. A frame is stamped with its playing time minus
+    its recorded delay (see :mod:`body_tracking.recording.stamps`); in a loop, stamps continue.
 
     Args:
         settings: uses ``file``, ``sensor``, ``recorded_sensor``, ``rate``, ``loop`` and ``start_time``.
@@ -142,7 +142,7 @@ def _is_bag(path: Path) -> bool:
 
 
 def _clock(frames: Iterator[tuple[int, RecordedFrame | None]]) -> RecordedClock | None:
-    """The sensor's clock against that of receipt; None without frames."""
+    """The sensor's clock against the clock of receipt; None without frames."""
     times = sorted((received_ns, frame.skeletons[0].stamp_ns) for received_ns, frame in frames if frame is not None)
     if not times:
         return None
@@ -155,7 +155,7 @@ def _frames(path: Path, sensor: str) -> Iterator[tuple[int, RecordedFrame | None
     if _is_bag(path):
         yield from _bag_frames(path, sensor)
         return
-    # A file without sensor names is of the wanted one.
+    # A file without sensor names belongs to the wanted sensor.
     names_itself = path.name.lower().endswith(CSV_SUFFIXES) and path.is_file() and sensor_column(path)
     for frame in open_recording(path, None if names_itself else sensor):
         yield frame.received_ns, frame if frame.sensor == sensor else None

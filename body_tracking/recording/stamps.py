@@ -1,8 +1,8 @@
 """Converts the header stamps of a recording to ROS time, the time of its log.
 
-If a sensor stamps by a clock of its own, log time minus stamp is the offset of the two clocks, which drifts, plus a
-delay. Delays are positive, so the clocks are related by the line below and nearest to all differences d, a linear
-program:
+If a sensor stamps by its own clock, log time minus stamp is the offset of the two clocks, which drifts, plus a delay.
+Delays are positive, so the relation of the clocks is the line that lies below all differences d and nearest to them, a
+linear program:
 
     min over a, b of sum(d_i - a - b stamp_i)  with  a + b stamp_i <= d_i for all i                                  (1)
 
@@ -34,7 +34,7 @@ SAME_CLOCK_NS: Final = NANOSECONDS // 10
 """Sensors whose median differences from the log are this close share a clock: their stamps keep their distances."""
 
 SET_NS: Final = NANOSECONDS
-"""A greater step of a clock means that it was set, or its sensor was restarted."""
+"""A larger step of a clock means that it was set, or its sensor was restarted."""
 
 MAX_DRIFT: Final = 1e-3
 """Seconds per second. Crystals drift by 1e-4, NTP slews the log's clock by up to 5e-4."""
@@ -47,7 +47,7 @@ _SAMPLES = 100
 _RESULT = re.compile(
     r"(/\w+)*/(ground_truth|fused|filtered|humans|calibration|tf|tf_static|imu/(skeleton|\w+/orientation))(/.*)?"
 )
-"""Topics stamped by the reference sensor's clock; the others are sensors'."""
+"""Topics stamped by the reference sensor's clock; the others have the clocks of their sensors."""
 
 _TIMES: Final = {0: struct.Struct(">iI"), 1: struct.Struct("<iI")}
 """``builtin_interfaces/Time`` in CDR, by the second byte of the encapsulation."""
@@ -207,7 +207,7 @@ class RecordedStamps:
 
 
 def _of_one_clock(found: Mapping[str, _Series]) -> list[list[str]]:
-    """Topics whose stamps are equally far from the log."""
+    """Groups of topics whose median differences from the log agree within :data:`SAME_CLOCK_NS`."""
     off = {topic: float(np.median(log_ns - stamps_ns)) for topic, (stamps_ns, log_ns) in found.items()}
     groups: list[list[str]] = []
     for topic in sorted(off, key=lambda topic: (off[topic], topic)):

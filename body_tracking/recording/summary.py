@@ -1,4 +1,4 @@
-"""What matters of a bag with joint angles: the poses of the sensors, and which angles are known, and how well."""
+"""Summary of a bag with joint angles: the poses of the sensors, the known angles and their standard deviations."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from body_tracking.pipeline import graph
 from body_tracking.recording.rosbag2 import BagReader, deserialize
 
 _READ: Final = 1000
-"""Messages of a person that are read at most, evenly over the bag."""
+"""Number of messages read per person, evenly over the bag; at most twice this number."""
 
 
 def summary(path: Path) -> Iterator[str]:

@@ -20,15 +20,15 @@ from body_tracking.viewing.handles import show
 from body_tracking.viewing.snapshot import Decode
 
 _PERIOD_S: Final = 0.1
-"""Least time between two images of a camera that are sent to the browsers, seconds."""
+"""Shortest interval between two images of a camera that are sent to the browsers, seconds."""
 
 
 class CameraView:
-    """What the page shows of cameras.
+    """Images of cameras on the page.
 
     Args:
         cameras: their names.
-        clock: seconds, for the rate.
+        clock: steady time in seconds, to limit the rate.
 
     Raises:
         SensorNameError: an invalid name.
@@ -46,11 +46,11 @@ class CameraView:
         (self._layer,) = self.layers
 
     def topics(self, visible: Mapping[str, bool]) -> Mapping[str, Codec]:
-        """The topics that are needed for the layers that are switched on, with the codecs of their messages."""
+        """Topics of the visible layers, with the codecs of their messages."""
         return {people_topic(camera): CompressedColour() for camera in self._cameras if visible[self._layer]}
 
     def start(self, server: Any) -> None:
-        """Make what is drawn."""
+        """Create the widgets."""
         black = np.zeros((3, 4, 3), np.uint8)
         with server.gui.add_folder("Cameras", order=0.5):
             self._shown = {camera: server.gui.add_image(black, label=camera, format="jpeg") for camera in self._cameras}
@@ -77,7 +77,7 @@ class CameraView:
 
 
 class RigView(CameraView):
-    """What the page shows of the cameras of a rig, whose file is in a folder.
+    """Images of a rig's cameras on the page; the rig's file is in a folder.
 
     Raises:
         SetupError: no such file.

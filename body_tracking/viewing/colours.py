@@ -24,7 +24,7 @@ PALETTE: Final[tuple[Colour, ...]] = (
     (0, 160, 170),
     (150, 110, 70),
 )
-"""Of the sensors, in their order; none is red."""
+"""Colours of the sensors, in their order; none is red."""
 FUSED: Final[Colour] = (120, 125, 130)
 FILTERED: Final[Colour] = (25, 30, 40)
 BODY: Final[Colour] = (196, 206, 220)
@@ -34,7 +34,7 @@ NOT_TRACKED: Final[Colour] = (150, 0, 0)
 
 
 def sensor_colours(sensors: Sequence[str]) -> dict[str, Colour]:
-    """A colour for each sensor; they repeat where there are more sensors than colours."""
+    """A colour for each sensor; they repeat if there are more sensors than colours."""
     return {sensor: PALETTE[index % len(PALETTE)] for index, sensor in enumerate(sensors)}
 
 

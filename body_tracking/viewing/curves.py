@@ -44,7 +44,7 @@ class AngleHistory:
 
     Args:
         window: seconds.
-        capacity: messages kept at most.
+        capacity: largest number of messages kept.
     """
 
     def __init__(self, window: float, capacity: int = 4096) -> None:
@@ -78,7 +78,7 @@ class AngleHistory:
             self._rows.popleft()
 
     def known(self) -> tuple[str, ...]:
-        """The angles that had a value with a standard deviation below ``UNKNOWN`` at any time that is shown."""
+        """Angles with a value and a standard deviation below ``UNKNOWN`` at any time in the window."""
         if not self._rows:
             return ()
         rows = np.array([row for _, row in list(self._rows)])
@@ -107,14 +107,14 @@ class AngleHistory:
 
 
 def extremes(series: FloatArray, count: int) -> IntArray:
-    """Samples to draw so that the others are not missed: the first, the last and the extremes.
+    """Samples that preserve the visible course of curves: the first, the last and the extremes.
 
-    The samples are split into intervals of equal length, of which the least and the greatest value of every series are
-    kept.
+    The samples are split into intervals of equal length; of each one the smallest and the largest value of every series
+    are kept.
 
     Args:
         series: (k, n) finite numbers, all over the same times.
-        count: of samples kept at most; at least 2 + 2 k.
+        count: largest number of samples kept; at least 2 + 2 k.
 
     Returns:
         (m,) ascending indices, m at most ``count``; all of them if n is at most ``count``.
@@ -133,7 +133,7 @@ def extremes(series: FloatArray, count: int) -> IntArray:
 
 
 def first_choice(names: Sequence[str], count: int) -> tuple[str, ...]:
-    """The angles that are plotted before the user has chosen: elbows and shoulders first."""
+    """The angles plotted before the user's choice: elbows and shoulders first."""
 
     def rank(name: str) -> int:
         return next((place for place, word in enumerate(_PREFERRED) if word in name), len(_PREFERRED))

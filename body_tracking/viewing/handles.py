@@ -17,8 +17,8 @@ from body_tracking.viewing.snapshot import Seen
 BALL: Final = trimesh.creation.icosphere(subdivisions=2)
 _JOINT_RADIUS: Final = 1e-3
 _JOINT: Final = trimesh.creation.icosphere(subdivisions=2, radius=_JOINT_RADIUS)
-"""Small before it is scaled: until a joint is first pointed at, viser's invisible outline of joints takes clicks at the
-origin, unscaled. A ball of a metre there kept those from the legs of whoever stood behind the reference sensor."""
+"""Small before scaling: until a joint is first pointed at, viser's invisible outline of joints takes clicks at the
+origin, unscaled. A ball of a metre there caught the clicks on the legs of people behind the reference sensor."""
 TUBE: Final = trimesh.creation.cylinder(radius=1.0, height=1.0, sections=16)
 STALE: Final[Colour] = (190, 190, 190)
 
@@ -39,12 +39,12 @@ class Drawn:
         self.draw(Seen(), False)
 
     def draw(self, seen: Seen, visible: bool, names: bool = False) -> None:
-        """Update them.
+        """Update the skeletons.
 
         Args:
             seen: the skeletons.
             visible: draw them.
-            names: with the name of each joint.
+            names: show the name of each joint.
         """
         drawn = figure(seen.skeletons if visible else (), self._colour)
         self._which = drawn.which
@@ -86,7 +86,7 @@ class Drawn:
 
 
 class Shapes:
-    """Any number of one mesh, each scaled, rotated and placed."""
+    """Any number of instances of one mesh, each scaled, rotated and placed."""
 
     def __init__(
         self,
@@ -115,7 +115,7 @@ class Shapes:
             positions: (n, 3) metres.
             quats_xyzw: (n, 4) unit quaternions; None for all upright.
             scales: (n, 3) along the mesh's own axes.
-            colour: of all, or (n, 3) of each.
+            colour: of all instances, or (n, 3) of each.
         """
         count = len(positions)
         if count == 0:

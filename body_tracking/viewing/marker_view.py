@@ -32,9 +32,9 @@ from body_tracking.viewing.snapshot import Decode
 _OPTICAL: Final = (0.5, -0.5, 0.5, -0.5)
 """Quaternion w x y z of an optical frame (x right, y down, z forward) that looks along x, with z up."""
 _TOLERANCE_NS: Final = NANOSECONDS // 500
-"""By which the stamps of messages of one time differ, as in ``marker_triangulation``."""
+"""Largest difference of the stamps of one instant, as in ``marker_triangulation``."""
 _WIDTH: Final = 480
-"""Pixels of an image on the page at most."""
+"""Largest width of an image on the page, pixels."""
 _BALL, _POINT, _JOINT = 0.008, 0.005, 0.015
 """Radii, metres."""
 _IMAGES, _CAMERAS, _POINTS, _TARGETS, _CHAIN = (
@@ -47,10 +47,10 @@ _IMAGES, _CAMERAS, _POINTS, _TARGETS, _CHAIN = (
 
 
 class MarkerView:
-    """What the page shows of a marker system.
+    """A marker system on the page.
 
     Args:
-        folder: the setup, as far as it is there already; without rig.yaml it shows no cameras.
+        folder: of the setup, which may be incomplete; without rig.yaml no cameras are shown.
 
     Raises:
         BodyTrackingError: a file cannot be read, or there is none.
@@ -78,7 +78,7 @@ class MarkerView:
         self._names = [setup.camera_name(camera.frame_id) for camera in cameras]
 
     def topics(self, visible: Mapping[str, bool]) -> Mapping[str, Codec]:
-        """The topics that are needed for the layers that are switched on, with the codecs of their messages."""
+        """Topics of the visible layers, with the codecs of their messages."""
         found: dict[str, Codec] = {}
         if visible[_IMAGES]:
             found |= {setup.image_topic(name): CameraImage() for name in self._names}
@@ -88,7 +88,7 @@ class MarkerView:
         return found | {setup.pose_topic(name): PoseOfTarget(name) for name in self._targets}
 
     def start(self, server: Any) -> None:
-        """Make what is drawn."""
+        """Create the nodes of the scene and the widgets."""
         scene = server.scene
         self._frame = scene.add_frame("/markers", show_axes=False, wxyz=_OPTICAL)
         self._cameras = [] if self._rig is None else _frustums(scene, self._names, self._rig)
@@ -118,7 +118,7 @@ class MarkerView:
         visible: Mapping[str, bool],
         poses: Mapping[str, SensorPose],
     ) -> FloatArray | None:
-        """Draw messages of one time; returns (3,) the middle of the targets in world, or None."""
+        """Draw messages of one instant; returns the (3,) mean position of the targets in world, or None."""
         at = {topic: {stamp_of(cdr): (topic, cdr) for cdr in each} for topic, each in recent.items() if each}
         posed, stamp_ns = self._one_time(at, decode)
         for camera in self._cameras:
@@ -141,7 +141,7 @@ class MarkerView:
     def _one_time(
         self, at: Mapping[str, Mapping[int, tuple[str, bytes]]], decode: Decode
     ) -> tuple[list[TargetPose], int | None]:
-        """The poses at the latest time of which there are images too, if there are any; and that time."""
+        """The poses at the latest time that also has images and balls, if any were received; and that time, ns."""
         posed = [at.get(setup.pose_topic(name), {}) for name in self._targets]
         stamps = sorted({stamp_ns for each in posed for stamp_ns in each}, reverse=True)
         topics = [topic(name) for topic in (setup.image_topic, setup.balls_topic) for name in self._names]
@@ -165,7 +165,7 @@ class MarkerView:
             if image is None:
                 continue
             taken_ns, _, pixels = image
-            # of another time they would be beside what the image shows
+            # balls and poses of another time would not match the image
             balls = _of_time(at.get(setup.balls_topic(name), {}), taken_ns, decode)
             posed = poses if stamp_ns is not None and abs(taken_ns - stamp_ns) <= _TOLERANCE_NS else ()
             assert self._rig is not None
@@ -193,7 +193,7 @@ class MarkerView:
 
 
 def _frustums(scene: Any, names: Sequence[str], rig: Rig) -> list[Any]:
-    """The views of the cameras with their names."""
+    """Frustums of the cameras, with their names."""
     frustums = []
     for name, camera, rotation, translation in zip(names, rig.cameras, rig.rotations, rig.translations, strict=True):
         path = f"/markers/cameras/{name}"
@@ -218,7 +218,7 @@ def _wxyz(rotation: FloatArray) -> FloatArray:
 
 
 def _nearest(messages: Mapping[int, tuple[str, bytes]], stamp_ns: int | None) -> int | None:
-    """The stamp of the message of a time, within the tolerance; None where there is none."""
+    """The stamp nearest to a time, within the tolerance; None without one."""
     if stamp_ns is None or not messages:
         return None
     nearest = min(messages, key=lambda each: abs(each - stamp_ns))
@@ -226,11 +226,11 @@ def _nearest(messages: Mapping[int, tuple[str, bytes]], stamp_ns: int | None) ->
 
 
 def _of_time(messages: Mapping[int, tuple[str, bytes]], stamp_ns: int | None, decode: Decode) -> Any:
-    """The payload of the message of a time; None where there is none."""
+    """The payload of the message nearest to a time, within the tolerance; None without one."""
     at_ns = _nearest(messages, stamp_ns)
     return None if at_ns is None else decode(*messages[at_ns])
 
 
 def _latest(messages: Mapping[int, tuple[str, bytes]], stamp_ns: int | None, decode: Decode) -> Any:
-    """The payload of the message of a time, or else of the latest one; None where there are none."""
+    """The payload of the message nearest to a time, else of the latest one; None without messages."""
     return _of_time(messages, stamp_ns, decode) or (decode(*messages[max(messages)]) if messages else None)

@@ -24,8 +24,8 @@ class Markers:
     """The markers of one message, in one frame at one time.
 
     Args:
-        stamp_ns: of all of them; 0 for whatever is the latest transform.
-        frame_id: of all of them.
+        stamp_ns: of all markers; 0 for the latest transform.
+        frame_id: of all markers.
         types: the family of message classes to build.
     """
 
@@ -52,7 +52,7 @@ class Markers:
             self._add(name, number, _SPHERE, size, self._colour(colour, opacity), self._pose(centre, quat))
 
     def lines(self, name: str, number: int, ends: FloatArray, pose: SensorPose, colour: Colour) -> None:
-        """(n, 2, 3) lines in a sensor's own frame, and its name."""
+        """Lines with (n, 2, 3) ends in a sensor's own frame, and the sensor's name above it."""
         width = self._types.make("geometry_msgs/msg/Vector3", x=0.008, y=0.0, z=0.0)
         placed = self._pose(pose.translation, pose.quat_xyzw)
         self._add(

@@ -23,20 +23,20 @@ from body_tracking.viewing.snapshot import Decode
 
 _SKIN: Final[Colour] = (214, 180, 150)
 _OPACITY: Final = 0.7
-"""Of the surface: the joints in it stay visible."""
+"""Opacity of the surface: the joints inside stay visible."""
 _WIDTH: Final = 480
-"""Pixels of an image on the page."""
+"""Width of an image on the page, pixels."""
 _PERIOD_S: Final = 0.1
-"""Least time between two images, or two meshes, of a camera that are sent to the browsers, seconds."""
+"""Shortest interval between two images, or two meshes, of a camera that are sent to the browsers, seconds."""
 _IMAGES, _MESH = "depth_images", "mesh"
 
 
 class MeshView:
-    """What the page shows of depth cameras.
+    """Depth cameras on the page.
 
     Args:
         cameras: their names.
-        clock: seconds, for the rate.
+        clock: steady time in seconds, to limit the rate.
 
     Raises:
         SensorNameError: an invalid name.
@@ -52,7 +52,7 @@ class MeshView:
         self._shown: dict[str, _CameraView] = {}
 
     def topics(self, visible: Mapping[str, bool]) -> Mapping[str, Codec]:
-        """The topics that are needed for the layers that are switched on, with the codecs of their messages."""
+        """Topics of the visible layers, with the codecs of their messages."""
         found: dict[str, Codec] = {}
         for camera in self._cameras:
             if visible[_IMAGES] or visible[_MESH]:
@@ -62,7 +62,7 @@ class MeshView:
         return found
 
     def start(self, server: Any) -> None:
-        """Make what is drawn."""
+        """Create the widgets."""
         with server.gui.add_folder("Depth cameras", order=0.5):
             self._shown = {camera: _CameraView(server, camera, self._clock) for camera in self._cameras}
 
@@ -101,7 +101,7 @@ class _CameraView:
         meshes = recent.get(mesh_topic(self._camera), ()) if visible[_IMAGES] or visible[_MESH] else ()
         show(self.image, visible[_IMAGES])
         self._surface.place(pose if visible[_MESH] and meshes else None)
-        # a mesh is published some images after its own
+        # a mesh is published some images after the image to which it was fitted
         by_stamp = {stamp_of(cdr): cdr for cdr in images}
         paired = [cdr for cdr in meshes if stamp_of(cdr) in by_stamp]
         mesh = (paired or meshes or (b"",))[-1]
@@ -132,7 +132,7 @@ class _Surface:
         self._frame = scene.add_frame(name, show_axes=False, visible=False)
         self._scene, self._name = scene, name
         self._first = np.zeros(0, np.intp)
-        """Of each vertex, its first corner."""
+        """First corner of each vertex."""
         self._faces = np.zeros((0, 3), np.intp)
         self._handle: Any = None
 
@@ -145,7 +145,7 @@ class _Surface:
     def draw(self, corners: FloatArray) -> None:
         """Draw (F, 3, 3) corners of triangles, metres in the camera's optical frame."""
         points = corners.reshape(-1, 3)
-        # corners at one place are one vertex, so that the surface is shaded smoothly; of all poses the same ones
+        # coinciding corners are one vertex, for smooth shading; the same corners coincide in all poses
         vertices = points[self._first] if self._faces.size == len(points) else points[:0]
         if not len(vertices) or not np.array_equal(vertices[self._faces.ravel()], points):
             vertices, self._first, inverse = np.unique(points, axis=0, return_index=True, return_inverse=True)

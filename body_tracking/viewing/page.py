@@ -45,7 +45,7 @@ from body_tracking.viewing.status import table
 _LAST_S: Final = 0.3
 """Seconds for the browsers to receive the last text."""
 WIDTH: Final = 290
-"""Pixels of each panel beside the scene, so that it has 440 of a tablet's 1024."""
+"""Width of each panel beside the scene, pixels; the scene keeps 440 of a tablet's 1024."""
 
 _INITIAL_TARGET: Final = np.array([2.2, 0.0, 0.0])
 """Point at which the camera looks before a person is seen: in front of the reference sensor, metres in world."""
@@ -77,8 +77,8 @@ class Page:
         filters: options.
         conventions: options.
         window: seconds that the plots show.
-        layers: further layers of the scene, by other systems.
-        views: likewise, those of several topics.
+        layers: further layers of the scene, of other systems.
+        views: of other systems, from several topics.
 
     Attributes:
         visible: which layers are switched on, by name.
@@ -216,7 +216,7 @@ class Page:
     def draw_views(
         self, recent: Mapping[str, Sequence[bytes]], decode: Decode, poses: Mapping[str, SensorPose]
     ) -> None:
-        """Update what other systems show from several topics; arguments as of :meth:`SystemView.draw`."""
+        """Update the views of other systems; arguments as of :meth:`SystemView.draw`."""
         with self._server.atomic():
             for view in self._views:
                 where = view.draw(recent, decode, self.visible, poses)
@@ -297,12 +297,12 @@ class Page:
             self._plots.draw(history)
 
     def draw_status(self, statuses: Mapping[str, NodeStatus], now: float) -> None:
-        """Show the nodes' diagnostics, and the controls that one of them answers."""
+        """Show the nodes' diagnostics, and the controls of nodes that report."""
         self._panel.draw(statuses, now, ended=False)
         self._table.content = table(statuses, now)
 
     def draw_end(self, statuses: Mapping[str, NodeStatus]) -> None:
-        """Say that the graph has ended, which stays in the browsers."""
+        """Show that the graph has ended; the text stays in the browsers."""
         self._panel.draw(statuses, 0.0, ended=True)
         self._server.flush()
         time.sleep(_LAST_S)

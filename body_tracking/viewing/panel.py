@@ -30,7 +30,7 @@ _REST_S: Final = 0.4
 
 
 class ControlPanel:
-    """Makes the controls, and shows those that a node answers.
+    """Creates the controls, and shows those of nodes that report.
 
     Args:
         server: of the page.
@@ -64,14 +64,14 @@ class ControlPanel:
             self._body = self._choice("person", (NONE,), self._controls.choose_body)
             self._groups["skeleton_filter"], self._groups["joint_angles"] = [self._filter], [self._convention]
         self._running: dict[str, str] = {}
-        """What skeleton_filter and joint_angles last said that they run, and whether the player loops."""
-        # Of the server's event loop: the steady time from which reports of the bag's place move the slider.
+        """Last reported filter, convention and loop state, by node."""
+        # For the server's event loop: only reports after this steady time move the slider.
         self._follows_from, self._resting = -math.inf, threading.Timer(0.0, lambda: None)
         self._place.on_update(self._on_place)
         self._loop.on_update(self._on_loop)
 
     def draw(self, statuses: Mapping[str, NodeStatus], now: float, ended: bool) -> None:
-        """Show the state, and what runs."""
+        """Show the state of the graph, the controls of its nodes and the current choices."""
         self._state.content = state_html(statuses, now, ended, self._sensors)
         show(self._end, not ended and self._controls.offers(END))
         there = {} if ended else fresh(statuses, now)
@@ -80,7 +80,7 @@ class ControlPanel:
                 show(each, node in there)
         for node, dropdown in (("skeleton_filter", self._filter), ("joint_angles", self._convention)):
             running = there[node].text.partition(" ")[0] if node in there else ""
-            # Only a change: until the node has taken a user's choice, it says what it ran before.
+            # Only a change: until the node has taken a user's choice, it reports the previous one.
             if running in dropdown.options and running != self._running.get(node):
                 dropdown.value = running
                 self._running[node] = running
@@ -100,7 +100,7 @@ class ControlPanel:
             self._loop.value, self._running[PLAYER] = loops == "True", loops
 
     def _show_place(self, place: float, reported: float) -> None:
-        """In the server's event loop, as :meth:`_on_place`: so it cannot come between a move and the reading of it."""
+        """Runs in the server's event loop like :meth:`_on_place`, so that a move is read before it is overwritten."""
         if reported > self._follows_from:
             self._place.value = place
 

@@ -14,9 +14,9 @@ from body_tracking.viewing.curves import BAND, AngleHistory, first_choice
 PLOTS: Final = 4
 """Number of plots."""
 POINTS: Final = 200
-"""Points of a plotted curve at most: about one per two pixels."""
+"""Largest number of points of a plotted curve: about one per two pixels."""
 HEIGHT: Final = 92
-"""Pixels of a plot, so that all are seen in a window of 720."""
+"""Height of a plot, pixels: all plots fit a window of 720."""
 NONE: Final = "none yet"
 _USUAL: Final = "elbows and shoulders"
 
@@ -58,7 +58,7 @@ class Plots:
 
 
 class _Plot:
-    """A plot of one angle with its band, which the user may choose.
+    """A plot of an angle chosen by the user, with its band.
 
     Args:
         gui: to add it to.
@@ -91,7 +91,7 @@ class _Plot:
         )
 
     def offer(self, names: tuple[str, ...], chosen: str) -> None:
-        """Offer these angles, and show one; hide the plot without one."""
+        """Offer these angles, and show the chosen one; hide the plot without a chosen one."""
         self._names = {label_of(name): name for name in names} or {NONE: ""}
         self._choice.options = tuple(self._names)
         self._choice.visible = self._plot.visible = bool(chosen) or not names

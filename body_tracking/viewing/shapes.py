@@ -43,7 +43,7 @@ _RADII: Final = {
     "ANKLE": 0.045,
     "FOOT": 0.035,
 }
-"""Metres, by the joint at the far end of the segment."""
+"""Radii of segments by the joint at the distal end, metres."""
 BONE_RADII: Final[FloatArray] = np.array(
     [_RADII[child.name.removesuffix("_LEFT").removesuffix("_RIGHT")] for _, child in BONES]
 )
@@ -56,9 +56,9 @@ class Figure:
 
     Attributes:
         joints: (n, 3) metres.
-        which: (n, 2) for each of them, the place of its skeleton and its number in :class:`Joint`.
+        which: (n, 2) index of each joint's skeleton, and its number in :class:`Joint`.
         joint_colours: (n, 3) RGB.
-        bones: (m, 2, 3) metres, their ends.
+        bones: (m, 2, 3) ends of the bones, metres.
     """
 
     joints: FloatArray
@@ -130,7 +130,7 @@ _SAME_BODY: Final = 0.5
 
 
 def with_legs(skeleton: Skeleton, others: Sequence[Skeleton]) -> Skeleton:
-    """The skeleton of a filter that has no legs, with those of the same body in another skeleton.
+    """A filter's skeleton without legs, completed by the legs of the same body in another skeleton.
 
     Args:
         skeleton: in world.

@@ -33,7 +33,7 @@ class Controls(Protocol):
         """Continue the bag at this place, seconds from its beginning."""
 
     def loop(self, on: bool) -> str:
-        """Play the bag again at its end, or not."""
+        """Switch the loop of the bag on or off."""
 
     def choose_filter(self, name: str) -> str:
         """Switch the filter."""
@@ -50,12 +50,12 @@ Decode: TypeAlias = Callable[[str, bytes], Any]
 
 
 class SystemView(Protocol):
-    """What a system shows from several topics; :class:`~body_tracking.pipeline.system.View` names its class.
+    """A system's part of the page, from several topics; :class:`~body_tracking.pipeline.system.View` names its class.
 
     Attributes:
-        layers: what can be switched on and off: label, and whether it is on at first, by name.
-        body: the person whose angles are shown where there are no sensors of skeletons; empty for none.
-        held: topics whose last message holds until the next one, however old, such as calibrations of cameras.
+        layers: label and initial visibility of each layer, by name.
+        body: the person whose angles are shown without sensors of skeletons; empty for none.
+        held: topics whose last message is valid until the next one, at any age, such as calibrations of cameras.
     """
 
     layers: Mapping[str, tuple[str, bool]]
@@ -63,10 +63,10 @@ class SystemView(Protocol):
     held: Collection[str]
 
     def topics(self, visible: Mapping[str, bool]) -> Mapping[str, Codec]:
-        """The topics that it takes while these layers are on, and the codecs of their messages."""
+        """Topics of the visible layers, with the codecs of their messages."""
 
     def start(self, server: Any) -> None:
-        """Make its parts in viser's scene and panels."""
+        """Create its parts of viser's scene and panels."""
 
     def draw(
         self,
@@ -78,13 +78,13 @@ class SystemView(Protocol):
         """Draw the latest messages.
 
         Args:
-            recent: the latest messages of each topic, in the order of their arrival; none of those that are old.
+            recent: the latest messages of each topic, in the order of their arrival, without old ones.
             decode: returns the payload of a message of a topic, None for one that is malformed.
             visible: which layers are switched on.
             poses: of calibrated sensors, by name.
 
         Returns:
-            (3,) where to look, metres in world, or None.
+            (3,) point to look at, metres in world, or None.
         """
 
 
@@ -111,7 +111,7 @@ class Snapshot:
         fused: in world.
         filtered: in world.
         origins: (n, 3) metres, of the model's segments in world.
-        quats_xyzw: (n, 4) their orientations.
+        quats_xyzw: (n, 4) orientations of the segments.
         layers: the payloads of further layers, by name.
     """
 

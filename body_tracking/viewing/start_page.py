@@ -1,4 +1,4 @@
-"""The page before a graph runs: recordings and sensors to choose from, and what else is in the ROS domain."""
+"""The page before a graph runs: recordings and sensors to choose from, and the nodes in the ROS domain."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from body_tracking.viewing.server import address_of, serve, stop
 from body_tracking.viewing.state import GREEN, GREY, ORANGE, RED, block, line
 
 DEFAULT: Final = "default"
-"""The filter that a graph has where none is chosen."""
+"""Choice of the graph's default filter."""
 _LEFT, _RIGHT = 540, 380
-"""Pixels of the panels: both fit a tablet of 1024."""
+"""Widths of the panels, pixels: both fit a tablet of 1024."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +27,7 @@ class Recording:
         path: of the bag.
         where: in words, such as "in this folder".
         content: its length and sensors in words.
-        refusal: why it cannot be played as it is; empty where it can.
+        refusal: reason why it cannot be played, or empty.
     """
 
     path: Path
@@ -38,11 +38,11 @@ class Recording:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """What the user has chosen.
+    """The user's choice.
 
     Attributes:
-        bag: to play; None for the sensors that publish.
-        loop: play it again and again.
+        bag: to play; None for the publishing sensors.
+        loop: play it in a loop.
         filter: a name, or :data:`DEFAULT`.
     """
 
@@ -108,7 +108,7 @@ class StartPage:
 
     @property
     def port(self) -> int:
-        """The one that it has got."""
+        """Port of the page."""
         return int(self._server.get_port())
 
     def say(self, text: str, colour: str) -> None:
@@ -144,10 +144,10 @@ class StartPage:
         """Show what is in the ROS domain.
 
         Args:
-            sensors: that publish, in words; empty for none.
+            sensors: publishing sensors, in words; empty for none.
             nodes: their names.
             runs: whether a graph runs already.
-            absent: what to say where no sensor publishes.
+            absent: text if no sensor publishes.
         """
         words = line(GREEN, "publish", html.escape(sensors)) if sensors else line(ORANGE, "none", html.escape(absent))
         self._set(self._sensors, block([words]))

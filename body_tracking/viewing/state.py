@@ -1,4 +1,4 @@
-"""The state of the graph in words, from the nodes' diagnostics: what plays, what records, how well it is calibrated."""
+"""The state of the graph in words, from the nodes' diagnostics: playback, recording and calibration."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _NOTHING: Final = (
 
 
 def fresh(statuses: Mapping[str, NodeStatus], now: float) -> dict[str, NodeStatus]:
-    """The nodes that have reported of late."""
+    """The nodes that have reported within :data:`FRESH`."""
     return {name: status for name, status in statuses.items() if now - status.received <= FRESH}
 
 
@@ -46,7 +46,7 @@ def state_html(statuses: Mapping[str, NodeStatus], now: float, ended: bool = Fal
 
 
 def _input(there: Mapping[str, NodeStatus], sensors: Sequence[str]) -> list[str]:
-    """The bag that plays, and the rate of each sensor; with a bag, none that is not in it."""
+    """The played bag, and the rate of each sensor; with a bag only of the sensors in diagnostics."""
     lines = []
     if (player := there.get(PLAYER)) is not None:
         bag = Path(player.values.get("bag", "")).name
@@ -73,7 +73,7 @@ def _input(there: Mapping[str, NodeStatus], sensors: Sequence[str]) -> list[str]
 
 
 def _calibration(there: Mapping[str, NodeStatus]) -> str:
-    """How well each sensor's pose is known, and what to do next."""
+    """The standard deviations of each sensor's pose, and the next step for the user."""
     status = there.get(CALIBRATION)
     if status is None:
         return ""

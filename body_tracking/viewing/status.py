@@ -17,7 +17,7 @@ _SILENT: Final = "#adb5bd"
 
 
 def _rate(status: NodeStatus) -> str:
-    """Messages per second of the node's busiest output, else of its busiest input; a dash where it has neither."""
+    """Rate of the node's busiest output, else of its busiest input; a dash without either."""
     for way in ("rate out ", "rate in "):
         rates = [status.number(name) for name in status.values if name.startswith(way)]
         known = [rate for rate in rates if rate is not None]
