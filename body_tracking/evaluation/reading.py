@@ -62,7 +62,7 @@ class AngleSeries:
         return np.where(np.isfinite(self.stddev), self.position, np.nan)
 
     def only(self, names: tuple[str, ...]) -> AngleSeries:
-        """Some of the angles."""
+        """The series of the named angles."""
         columns = [self.names.index(name) for name in names]
         return AngleSeries(self.stamps_ns, names, self.position[:, columns], self.stddev[:, columns])
 

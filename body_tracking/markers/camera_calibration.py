@@ -29,9 +29,9 @@ PLUMB_BOB: Final = (0, 1, 2, 3, 4)
 """All of ``plumb_bob``: k1, k2, p1, p2, k3."""
 
 MIN_CORNERS: Final = 6
-"""Of a board in an image: four determine its pose and leave no redundancy to check it."""
+"""Least number of a board's corners in an image: four determine its pose, without redundancy to check it."""
 MIN_BOARDS: Final = 3
-"""In images of a camera: two or more determine a camera's matrix (Zhang 2000), one more checks it."""
+"""Least number of boards in a camera's images: two determine a camera's matrix (Zhang 2000), one more checks it."""
 _PLANE: Final = (4.0, 2.0)
 """A board is rejected if its RMS about its homography exceeds the first number times the camera's median plus the
 second number of pixels: lens distortion, which a homography does not model, bends rows by pixels."""

@@ -28,9 +28,9 @@ _ROUNDS: Final = 10
 _HOPELESS: Final = 200.0
 """Difference of weighted sums of squares at which the worse model has no chance."""
 _EXPECTED_EDGE: Final = 0.8
-"""Standard deviation of the edge's blur, pixels: expected value,"""
+"""Expected standard deviation of the edge's blur, pixels."""
 _EDGE_RANGE: Final = 0.4
-"""and the standard deviation of its prior."""
+"""Standard deviation of the prior of that value, pixels."""
 _LEAST_EDGE: Final = 0.2
 _MOST_EDGE: Final = 4.0
 _LEAST_RADIUS: Final = 0.7

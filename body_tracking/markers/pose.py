@@ -31,7 +31,7 @@ _MAX_ANGLE_STDDEV: Final = 0.5
 """Radians: above it the rotation counts as undetermined, because the linearised covariance is invalid."""
 _ITERATIONS: Final = 10
 _CONVERGED: Final = 1e-7
-"""Metres and radians."""
+"""Largest step at convergence, metres and radians."""
 
 
 class PoseError(BodyTrackingError):

@@ -11,7 +11,7 @@ from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import FloatArray
 
 _VERTICES: Final = 64
-"""Of the outline's polygon; the centroid error for a ball of 14 mm is below 1e-4 pixels."""
+"""Number of vertices of the outline's polygon; the centroid error for a ball of 14 mm is below 1e-4 pixels."""
 _ITERATIONS: Final = 3
 
 

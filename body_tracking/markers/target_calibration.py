@@ -24,7 +24,7 @@ _MISSED: Final = 1e-4
 """Share of correct views rejected as outliers."""
 _ITERATIONS: Final = 30
 _CONVERGED: Final = 1e-8
-"""Metres."""
+"""Largest step at convergence, metres and radians."""
 _RIGID: Final = 0.1
 """Noise of a coordinate as a share of the target's size, above which the views contradict each other."""
 _BENT: Final = 3.0

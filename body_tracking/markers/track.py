@@ -25,9 +25,9 @@ class Motion:
 
     Attributes:
         acceleration: m/s^2, standard deviation, constant between two frames.
-        angular_acceleration: rad/s^2, likewise.
+        angular_acceleration: rad/s^2, standard deviation, constant between two frames.
         speed: m/s, standard deviation when a target is recognised.
-        angular_speed: rad/s, likewise.
+        angular_speed: rad/s, standard deviation when a target is recognised.
         coast: seconds for which an unseen target is predicted.
     """
 

@@ -165,7 +165,7 @@ def _epipolar_distances(
         baseline: (3,) from the first camera to the second, metres.
         shift: (3, r) effect of the calibration's unknowns on the baseline.
         a: rotation (3, 3) of the first camera; directions, spread and flat_factor of its balls.
-        b: of the second camera, likewise.
+        b: the same of the second camera.
         distance: written.
     """
     a_turn, a_directions, a_spread, a_factor = a

@@ -137,7 +137,7 @@ class _Selected(NamedTuple):
     targets: FloatArray | None
     """(H + 16, 2) pixels, held while the Jacobian is computed; None to look them up."""
     behind: FloatArray | None
-    """(H, 3) metres, likewise."""
+    """(H, 3) metres, held in the same way."""
 
 
 class JatesiktatFitter:
