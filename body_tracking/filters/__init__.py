@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from body_tracking.core.skeleton import Skeleton
     from body_tracking.kinematics.upper_body import UpperBody
 
-_LINEAR: Final = ("linear:LinearKalmanFilter", "linear:LinearKalmanParameters", "")
+_LINEAR: Final = ("linear:LinearKalmanFilter", "parameters:LinearKalmanParameters", "")
 # name: module and class, those of its parameters, prefix of their names in the table of all filters
 _FILTERS: Final = {
     "lkf_zero_velocity": _LINEAR,
@@ -92,7 +92,7 @@ def parameter_classes() -> dict[str, type[Any]]:
 
 def _row(name: str) -> tuple[str, str, str]:
     if name not in _FILTERS:
-        error: type[Exception] = _load("linear:FilterError")
+        error: type[Exception] = _load("parameters:FilterError")
         raise error(f"unknown filter {name!r}, expected one of {', '.join(FILTERS)}")
     return _FILTERS[name]
 
@@ -126,7 +126,7 @@ def make_filter(name: str, **parameters: Any) -> SkeletonFilter:
     settings_class = _load(parameters_class)
     unknown = parameters.keys() - {item.name for item in fields(settings_class)}
     if unknown:
-        error: type[Exception] = _load("linear:FilterError")
+        error: type[Exception] = _load("parameters:FilterError")
         raise error(f"filter {name}: unknown parameter(s) {', '.join(sorted(unknown))}")
     made, settings = _load(filter_class), settings_class(**parameters)
     result: SkeletonFilter = made(name, settings) if filter_class == _LINEAR[0] else made(settings)

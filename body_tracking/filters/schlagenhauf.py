@@ -30,7 +30,7 @@ from body_tracking.core.skeleton import (
     TrackingState,
 )
 from body_tracking.filters.arrival import Arrival, Arrivals
-from body_tracking.filters.linear import FilterError
+from body_tracking.filters.parameters import FilterError
 from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
 
 SCHLAGENHAUF_EKF = "schlagenhauf_ekf"

@@ -33,7 +33,7 @@ import numpy as np
 from body_tracking.core.parameters import check_fields, number_field
 from body_tracking.core.skeleton import N_JOINTS, BoolArray, FloatArray, Skeleton, TrackingState
 from body_tracking.filters.arrival import Arrival, Arrivals
-from body_tracking.filters.linear import FilterError
+from body_tracking.filters.parameters import FilterError
 
 THESIS_LKF1 = "thesis_lkf1"
 THESIS_LKF2 = "thesis_lkf2"

@@ -24,7 +24,8 @@ from body_tracking.filters import (
     parameter_classes,
     parameter_prefix,
 )
-from body_tracking.filters.linear import LINEAR_MODELS, FilterError
+from body_tracking.filters.linear import LINEAR_MODELS
+from body_tracking.filters.parameters import FilterError
 from body_tracking.filters.prediction import PERIOD_NS, Prediction
 from draws import draws
 from patience import PATIENCE

@@ -21,8 +21,8 @@ from body_tracking.filters.linear import (
     LINEAR_MODELS,
     ZERO_VELOCITY,
     LinearKalmanFilter,
-    LinearKalmanParameters,
 )
+from body_tracking.filters.parameters import LinearKalmanParameters
 from body_tracking.kinematics.motion import joint_densities
 from draws import draws
 from walkers import TRACKED

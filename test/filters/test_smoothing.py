@@ -15,7 +15,8 @@ from body_tracking.core.parameters import check_all
 from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton
 from body_tracking.filters.ekf.filter import ExtendedKalmanFilter
 from body_tracking.filters.ekf.parameters import EkfParameters
-from body_tracking.filters.linear import CONSTANT_VELOCITY, LinearKalmanFilter, LinearKalmanParameters
+from body_tracking.filters.linear import CONSTANT_VELOCITY, LinearKalmanFilter
+from body_tracking.filters.parameters import LinearKalmanParameters
 from body_tracking.filters.people import filter_of
 from body_tracking.filters.person import FilterSettings
 from body_tracking.filters.smoothing import FixedLag, SmoothableFilter

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from body_tracking.core import chi_square
 from body_tracking.core.parameters import check_fields, number_field
 from body_tracking.filters.ekf.sources import OrientationParameters
-from body_tracking.filters.linear import T_POSE, FilterError
+from body_tracking.filters.parameters import T_POSE, FilterError
 
 
 @dataclass(frozen=True, slots=True)
