@@ -1,4 +1,4 @@
-"""Points in a C3D file, read with ezc3d, in metres; those of one subject by their names, z up."""
+"""Points of a C3D file, read with ezc3d; the points of one subject by name, in metres, z up."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 UP_FIRST = {"+X": (1, 2, 0), "+Y": (2, 0, 1), "+Z": (0, 1, 2)}
 """The cyclic permutation that makes an axis of the file z, by the axis that points up."""
 _COMPUTED = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS")
-"""Parameters of the group POINT that list the labels of points that are no places (https://www.c3d.org, POINT)."""
+"""Parameters of the group POINT that list labels of points with other quantities (https://www.c3d.org, POINT)."""
 
 _BLOCK = 512
 _BIG_ENDIAN = 86
@@ -36,8 +36,8 @@ class C3dPoints:
 
     Attributes:
         labels: of the first points; further ones have none.
-        data: (n, p, 3) in the file's axes and in ``scale`` metres (what is listed in ``computed``: in other units), NaN
-            where a point is not seen.
+        data: (n, p, 3) in the file's axes and in ``scale`` metres (points in ``computed``: in other units), NaN where a
+            point is not seen.
         scale: metres per unit of length.
         up: the axis that points up (POINT:Y_SCREEN), such as ``+Z``; empty where the file does not say.
         rate: frames per second.

@@ -20,7 +20,7 @@ MODELS: Final = {"plumb_bob": 5, "rational_polynomial": 8}
 
 _ITERATIONS: Final = 30
 _CONVERGED: Final = 1e-12
-"""Normalised image coordinates by which a Newton step may still move."""
+"""Largest Newton step at convergence, normalised image coordinates."""
 
 
 class CameraError(BodyTrackingError):
@@ -73,7 +73,7 @@ class Camera:
             )
 
     def is_like(self, other: Camera) -> bool:
-        """Whether another calibration is the same, whatever its frame is called: drivers send one with each image."""
+        """Whether another calibration differs at most in the frame's name: drivers send one with each image."""
         same = (self.width, self.height, self.model) == (other.width, other.height, other.model)
         return same and np.array_equal(self.matrix, other.matrix) and np.array_equal(self.distortion, other.distortion)
 

@@ -25,17 +25,16 @@ LOOPS: list[Any] = []
 """All compiled functions of the modules that have been imported."""
 
 _VERSIONS_KEPT = 4
-"""Of a module's machine code: those of as many checkouts as one works with side by side."""
+"""Versions of a module's machine code: one for each of a developer's checkouts."""
 
 _digests: dict[str, str] = {}
-"""By the names of modules that have compiled functions."""
+"""Digest of each module that has compiled functions, by the module's name."""
 
 
 def compiled(function: _Function) -> _Function:
     """Compile a function of numbers and arrays; its types stay those of the Python function.
 
-    The machine code is kept in the user's cache folder; where that one cannot be written to, each process compiles
-    anew.
+    The machine code is kept in the user's cache folder; if that is not writable, each process compiles anew.
     """
     settings: Any = numba.config
     before, settings.CACHE_LOCATOR_CLASSES = settings.CACHE_LOCATOR_CLASSES, f"{__name__}.{ByContent.__name__}"
@@ -50,11 +49,11 @@ def compiled(function: _Function) -> _Function:
 
 
 class ByContent(UserWideCacheLocator):
-    """Machine code in a folder that is named after all that it was made of.
+    """Locator of machine code in a folder whose name holds the digest of the source and of its imports.
 
-    numba's own locators compare nothing but the file of the function itself: where a function or a constant that it
-    imports from another module changes, they go on with the old one. Copies of the package with equal modules (an
-    installed one, a workspace, a second checkout) share what was compiled.
+    numba's own locators check only the function's own file: after a change of an imported function or constant they
+    return outdated code. Copies of the package with equal modules (an installed one, a workspace, a second checkout)
+    share the machine code.
     """
 
     def __init__(self, function: Any, path: str) -> None:
@@ -76,15 +75,15 @@ class ByContent(UserWideCacheLocator):
         super().ensure_cache_path()  # type: ignore[no-untyped-call]
 
     def get_source_stamp(self) -> str:
-        """Of what the code was made."""
+        """Digest of the source and of its imports."""
         return self._digest
 
 
 def digest(function: Any, path: str) -> str:
-    """Of a module's source, and of the compiled functions and the constants that it imports, as hexadecimal digits.
+    """SHA-256 of a module's source and of the compiled functions and constants that it imports, hexadecimal.
 
     Args:
-        function: the first one of the module that is compiled: what it imports is there by then.
+        function: the module's first compiled function; the module has run its imports by then.
         path: of the module's file.
     """
     module = function.__module__
@@ -106,7 +105,7 @@ def digest(function: Any, path: str) -> str:
 
 
 def _remove_oldest(folders: Iterable[Path]) -> None:
-    """Remove all but the most recently used versions of a module's code, less the one that is to come."""
+    """Remove a module's least recently used versions; with the one to be written, ``_VERSIONS_KEPT`` remain."""
     with contextlib.suppress(OSError):  # another process removes them too
         newest_first = sorted(folders, key=os.path.getmtime, reverse=True)
         for folder in newest_first[_VERSIONS_KEPT - 1 :]:

@@ -1,4 +1,4 @@
-"""Small linear algebra within compiled loops, where a call of LAPACK costs more than its numbers."""
+"""Small linear algebra within compiled loops, where the overhead of a LAPACK call exceeds its arithmetic."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from body_tracking.core.skeleton import FloatArray
 def whitening_of(covariance: FloatArray, whitening: FloatArray) -> bool:
     """Write the inverse of Cholesky's factor of a matrix (n, n); False where it is not positive definite.
 
-    Of ``W``, ``W.T @ W`` is the inverse of the matrix. What is above its diagonal is written, too: zeros.
+    For the result W, ``W.T @ W`` is the inverse of the matrix. The zeros above its diagonal are written, too.
     """
     size = len(covariance)
     lower = np.empty((size, size))

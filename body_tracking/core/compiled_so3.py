@@ -39,13 +39,13 @@ def turned(vector: FloatArray, rotation: FloatArray) -> FloatArray:
 
 @compiled
 def turn_between(before: FloatArray, after: FloatArray) -> FloatArray:
-    """(3,) radians, the shortest rotation vector v with ``exp(v) @ before`` the rotation after, (3, 3) both."""
+    """(3,) radians: the shortest rotation vector v with ``exp(v) @ before == after``, both (3, 3)."""
     r = np.zeros((3, 3))
     for i in range(3):
         for j in range(3):
             for k in range(3):
                 r[i, j] += after[i, k] * before[j, k]
-    # four times the products of the quaternion's numbers with the largest one, which is the best conditioned
+    # four times the products of the quaternion's components with the largest one, the best conditioned choice
     trace = r[0, 0] + r[1, 1] + r[2, 2]
     q = np.empty(4)
     if trace >= max(r[0, 0], r[1, 1], r[2, 2]):
@@ -63,6 +63,6 @@ def turn_between(before: FloatArray, after: FloatArray) -> FloatArray:
     if q[3] < 0.0:
         q = -q
     norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
-    # where the vector is nothing, its angle is twice the vector by the scalar
+    # for a vanishing vector part the rotation vector is twice the vector over the scalar
     scale = 2.0 * math.atan2(norm, q[3]) / norm if norm > _SMALL * q[3] else 2.0 / q[3]
     return scale * q[:3]

@@ -22,7 +22,7 @@ MAX_NUMBER = 100
 """Characters of a number."""
 
 SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-"""libyaml's where PyYAML was built with it, which is ten times as fast."""
+"""libyaml's loader, ten times as fast, where PyYAML was built with it."""
 
 _SafeDumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
@@ -130,7 +130,7 @@ def load_yaml(text: str, loader: Any = SafeLoader, *, aliases: bool = True) -> A
     except BodyTrackingError:
         raise
     except yaml.MarkedYAMLError as error:
-        if "nesting depth" in str(error):  # libyaml's own limit (1000), before it tells of the first level
+        if "nesting depth" in str(error):  # libyaml's own limit (1000), reached before it emits the first event
             raise FileLimitError(f"is not read (nested deeper than {MAX_DEPTH})") from error
         raise FileError(f"is not YAML ({' '.join(str(error).split())})") from error
     except Exception as error:  # constructors of numbers and times raise errors of their own

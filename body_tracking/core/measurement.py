@@ -37,9 +37,9 @@ INFERRED_FACTOR = 3.0
 
 BONE_CORRELATION = 0.86
 """Correlation of the errors of the two joints of a bone: a skeleton camera displaces neighbouring joints alike, so that
-bones have better directions than independent joints would give. With it the stated variances of elevation and elbow are
-those of the errors of a Kinect v2 against Vicon that the law of the arms' directions leaves in people whom it was not
-fitted to (``benchmarks/kinect_vs_vicon.py --fit``)."""
+bones have better directions than independent joints would give. With this value the stated variances of elevation and
+elbow match the errors of a Kinect v2 against Vicon that remain after the correction of the arms' directions, in people
+to whom the correction was not fitted (``benchmarks/kinect_vs_vicon.py --fit``)."""
 
 _LEFT_ENDS = np.array([Joint.SHOULDER_LEFT, Joint.HIP_LEFT], dtype=np.intp)
 _RIGHT_ENDS = np.array([Joint.SHOULDER_RIGHT, Joint.HIP_RIGHT], dtype=np.intp)
@@ -54,8 +54,8 @@ _REFERENCE_DISTANCE = 2.0
 def joint_correlation(of_bones: float = BONE_CORRELATION) -> FloatArray:
     """(25, 25) correlation of the joints' errors, ``of_bones`` to the power of the number of bones between two joints.
 
-    That is the Markov field on the tree of bones: given a joint, the two sides of it are independent. Its inverse has
-    entries on the bones alone.
+    This is the Gauss-Markov field on the tree of bones: given a joint, the two sides of it are independent. Outside the
+    diagonal, the inverse has entries only for the two joints of a bone.
 
     Args:
         of_bones: correlation of the two joints of a bone, from 0 (independent) to less than 1.
@@ -95,7 +95,7 @@ def body_heading(positions: FloatArray) -> FloatArray:
 
 
 def viewing_angle(positions: FloatArray) -> FloatArray:
-    """The angle between the way a body faces and the direction to the sensor, in the horizontal plane.
+    """The angle between a body's facing direction and the direction to the sensor, in the horizontal plane.
 
     Args:
         positions: (..., 25, 3) metres in a sensor's optical frame (x right, y down, z forward).
@@ -139,11 +139,11 @@ def joint_stddev(positions: FloatArray, states: np.ndarray, angle: FloatArray | 
 def joint_variance(
     positions: FloatArray, states: np.ndarray, covariances: FloatArray | None, angle: FloatArray | None = None
 ) -> FloatArray:
-    """The variance of each joint position of a frame per axis: as its sensor states it, else of :func:`joint_stddev`.
+    """The variance per axis of each joint position: stated by the sensor, else that of :func:`joint_stddev`.
 
-    Nothing counts as more certain than :data:`BASE_STDDEV`: the deviations of a linear filter's angles take errors of
-    neighbouring joints to be as much alike as a Kinect's (:data:`BONE_CORRELATION`). With the 15 mm that the fit of a
-    mesh states, the elevation was within 1.96 deviations in 80 % of the frames; so it is in 93 %.
+    :data:`BASE_STDDEV` is the lower bound: a linear filter's deviations of angles assume that errors of neighbouring
+    joints correlate as a Kinect's do (:data:`BONE_CORRELATION`). With the 15 mm that the fit of a mesh states, the
+    elevation was within 1.96 deviations in 80 % of the frames; with the bound it is in 93 %.
 
     Args:
         positions: (25, 3) metres in the sensor's optical frame.

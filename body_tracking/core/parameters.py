@@ -43,7 +43,7 @@ class Parameter:
         max: the greatest value, of a number.
         choices: the allowed values, of a string; empty for any.
         live: whether it may change while the node runs.
-        fixed: why it may not; empty where the reason is only that it is read at the start.
+        fixed: why it may not change while the node runs; empty for the usual reason, that it is read at the start.
     """
 
     name: str
@@ -85,7 +85,7 @@ class Parameter:
         if isinstance(checked, int | float) and not isinstance(checked, bool):
             low = -math.inf if self.min is None else self.min
             high = math.inf if self.max is None else self.max
-            # a number may be infinite where its bound says so
+            # infinity is allowed only as a bound
             if not low <= checked <= high or (math.isinf(checked) and checked not in (self.min, self.max)):
                 raise ParameterError(f"parameter {self.name!r}: {value!r}, expected {self.constraint or 'finite'}")
         if self.choices and checked not in self.choices:
@@ -180,7 +180,7 @@ def check_fields(parameters: Any, what: str, error: type[BodyTrackingError]) -> 
 
 
 def fields_of(parameter_class: type[Any], values: Mapping[str, Value], *, prefix: str = "") -> dict[str, Any]:
-    """Those of a node's values that are fields of a parameter dataclass; ``prefix`` as in :func:`parameters_from`."""
+    """The node's values that are fields of a parameter dataclass; ``prefix`` as in :func:`parameters_from`."""
     names = (item.name for item in fields(parameter_class))
     return {name: values[f"{prefix}{name}"] for name in names if f"{prefix}{name}" in values}
 

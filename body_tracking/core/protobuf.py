@@ -70,7 +70,7 @@ def message(of: Fields, number: int) -> Fields:
     """The last message in a field; empty without one.
 
     Raises:
-        ProtobufError: it is none.
+        ProtobufError: the field is a number.
     """
     value = of.get(number, [b""])[-1]
     if not isinstance(value, bytes):

@@ -21,7 +21,7 @@ SKEW: FloatArray = -_LEVI_CIVITA.reshape(3, 9)
 _ONES = np.ones((3, 1))
 
 _MATRIX = np.zeros((16, 9))
-# R = (w^2 - u.u) I + 2 u u^T + 2 w [u]x, as the linear map of the products of the quaternion's numbers
+# R = (w^2 - u.u) I + 2 u u^T + 2 w [u]x, as a linear map of the products of the quaternion's components
 for _i in range(3):
     for _j in range(3):
         _MATRIX[4 * _i + _j, 3 * _i + _j] += 2.0
@@ -29,7 +29,7 @@ for _i in range(3):
     _MATRIX[15, 4 * _i] += 1.0
 _MATRIX[3:12:4] += 2.0 * SKEW
 
-# four times the products of a quaternion's numbers, as a linear map of its rotation matrix and constants
+# four times the products of a quaternion's components, as a linear map of its rotation matrix and constants
 _PRODUCTS: FloatArray = np.zeros((3, 3, 4, 4))
 for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     _PRODUCTS[_i, _i] = np.diag([-1.0, -1.0, -1.0, 1.0])
@@ -65,7 +65,7 @@ def quat_to_matrix(q: FloatArray) -> FloatArray:
 
 def matrix_to_quat(matrix: FloatArray) -> FloatArray:
     """(..., 4) unit quaternions xyzw, w >= 0, of (..., 3, 3) rotation matrices (Shepperd 1978: by the largest part)."""
-    # four times the products of the quaternion's numbers: (n, 4, 4), its largest row is the best conditioned
+    # four times the products of the quaternion's components, (n, 4, 4); the largest row is the best conditioned
     outer = (matrix.reshape(-1, 9) @ _PRODUCTS + _UNIT_PRODUCTS).reshape(-1, 4)
     best = outer.reshape(-1, 16)[:, ::5].argmax(axis=1)
     q = outer[4 * np.arange(len(best)) + best]
