@@ -232,7 +232,7 @@ def bodies(count: int) -> tuple[str, ...]:
 
 
 URDF_QOS = Qos(durability="transient_local", depth=1)
-"""Of a person's model: a late subscriber gets the latest one."""
+"""Profile of a person's URDF: a late subscriber gets the latest one."""
 
 
 def check_body(body: str) -> str:

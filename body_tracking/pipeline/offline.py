@@ -12,7 +12,7 @@ from body_tracking.messages.codecs import Wire
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
 
 _LOOKS = 2
-"""A stage changes its inputs only after it has seen the same topics at so many looks."""
+"""Looks at the same topics after which a stage changes its inputs."""
 
 
 def connect(stages: Sequence[Stage], published: Iterable[str] = ()) -> None:
@@ -33,7 +33,7 @@ class OfflineRunner:
         stages: in the order in which they take each message.
         wire: for messages that this package does not write itself.
         sink: gets topic, message and time of every output.
-        published: topics that others publish.
+        published: topics that are not outputs of these stages.
 
     Attributes:
         counters: inputs that could not be used, by topic.
@@ -75,13 +75,13 @@ class OfflineRunner:
         self._deliver(at_ns)
 
     def finish(self, at_ns: int) -> None:
-        """Publish what still waits for later messages."""
+        """Publish the outputs that still wait for later messages."""
         for number, stage in enumerate(self._stages):
             self._publish(number, stage.drain(), at_ns)
             self._deliver(at_ns)
 
     def _poll(self, at_ns: int) -> None:
-        """Let every stage publish what is due."""
+        """Let every stage publish the outputs that are due."""
         for number, stage in enumerate(self._stages):
             due_ns = stage.deadline_ns if stage.deadline_ns is not None else stage.due_ns
             if due_ns is not None and due_ns <= at_ns:

@@ -66,7 +66,8 @@ class SubjectSelector:
     """Picks one body per instant: the one with the last picked number, else the body nearest to the frame's origin.
 
     Args:
-        hold: seconds for which nobody else is picked while the picked one is absent, such as in a message of its own.
+        hold: seconds for which nobody else is picked while the picked body is absent, as where each body has a message
+            of its own.
     """
 
     def __init__(self, hold: float = 0.0) -> None:
@@ -75,7 +76,7 @@ class SubjectSelector:
         self._seen_ns = 0
 
     def pick(self, skeletons: Sequence[Skeleton]) -> Skeleton | None:
-        """The subject among skeletons of one instant; None where none has a valid joint, or the subject is held."""
+        """The subject among skeletons of one instant; None where none is valid, or ``hold`` has not passed yet."""
         seen = [skeleton for skeleton in skeletons if skeleton.valid.any()]
         subject = next((skeleton for skeleton in seen if skeleton.body == self.body), None)
         if subject is None and seen:

@@ -44,8 +44,8 @@ REFERENCE = Parameter(
 )
 
 FRAMES_KEPT = 16
-"""Half a second of a Kinect's frames, so that a node that is held up for so long loses none; a node that is always too
-slow drops the oldest (:mod:`body_tracking.ros.backlog`)."""
+"""Queue of half a second of a Kinect's frames, so that a node delayed by that long loses none; a node that is always
+too slow drops the oldest (:mod:`body_tracking.ros.backlog`)."""
 
 
 def names_in(value: Value) -> tuple[str, ...]:

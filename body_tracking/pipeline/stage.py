@@ -149,7 +149,7 @@ class Stage:
         """Forget the state, because the stamps of an input jumped back."""
 
     def look(self, published: Callable[[str], bool]) -> bool:
-        """Choose the inputs among the published topics; whether :attr:`inputs` have changed."""
+        """Choose the inputs among the published topics; returns whether :attr:`inputs` have changed."""
         return False
 
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:

@@ -23,8 +23,8 @@ Options: TypeAlias = Mapping[str, Value]
 class Place(IntEnum):
     """A node's place between the sensors and the angles.
 
-    No node needs an output of a later one; the orientations of inertial sensors, which improve what a node of IMAGES
-    finds, are the one that it may take.
+    No node needs an output of a later one. One use is optional: a node of IMAGES takes orientations of inertial
+    sensors, which improve its estimates.
     """
 
     SOURCE = 0
@@ -44,7 +44,7 @@ class Option:
 
     Attributes:
         name: with underscores; ``--name-with-dashes`` on a command line.
-        default: its type is the option's type; a tuple is given several times, a switch has no value.
+        default: its type is the option's type; a tuple makes an option that may be repeated, a bool a switch.
         text: for the help.
         metavar: placeholder of the value in the help.
         choices: returns the allowed values; None for any.
@@ -52,7 +52,7 @@ class Option:
         parameter: the equivalent (node, parameter) of a parameters file, which the option overrides.
         hidden: no command has it, only the parameters file.
         offline: ``replay`` has it, too.
-        source: with a value, the graph has sensors of its own beside those of the option ``sensors``.
+        source: given a value, the graph has further sensors beside those of the option ``sensors``.
         example: a value with which a graph has the nodes that depend on it, for lists of all nodes.
     """
 
@@ -175,12 +175,12 @@ class Layer:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What the viewer shows of a system from several topics, or beside the scene.
+    """A view of a system in the viewer that combines several topics, or stands beside the scene.
 
     Attributes:
-        option: name of the system's option that it is made with, which becomes a parameter of the viewer; without a
+        option: name of the system's option that configures the view and becomes a parameter of the viewer; without a
             value there is no view.
-        make: ``module:Class`` of a :class:`body_tracking.viewing.snapshot.SystemView`, which is given that value.
+        make: ``module:Class`` of a :class:`body_tracking.viewing.snapshot.SystemView`; it gets the option's value.
     """
 
     option: str
@@ -205,12 +205,12 @@ class System:
         order: among the systems, in tables.
         nodes: its executables.
         specs: returns the nodes that it runs for given options, without their namespace.
-        played: returns which topics of a bag take the place of its sensors, given the options and the bag's topics;
-            none where it has no sensors in such a graph. Raises GraphError where the bag lacks one.
-        finds: returns options with which a graph takes the sensors that publish, given the type of each topic; none
-            where no sensor of the system does.
-        computes: returns the sensors whose skeletons its own nodes publish; they join those of the option ``sensors``,
-            and take the place of its default.
+        played: returns the topics of a bag that replace its sensors, given the options and the bag's topics; none where
+            it has no sensors in such a graph. Raises GraphError where the bag lacks one.
+        finds: returns the options for those of its sensors that publish now, given the type of each topic; none where
+            no sensor publishes.
+        computes: returns the sensors whose skeletons its own nodes publish; they are added to those of the option
+            ``sensors``, and replace its default.
         options, topics, services, commands, layers, views: that it adds.
         prepare: ``module:function`` that runs every compiled loop of the system once; empty where it has none.
     """
