@@ -21,7 +21,7 @@ from body_tracking.fusion.placement import WORLD, PlacedSensors, Placement
 from body_tracking.fusion.sides import Sides
 
 FRESH = 0.1
-"""Largest time to another sensor's frame that counts for left and right, seconds."""
+"""Largest time to another sensor's frame that helps to decide left and right, seconds."""
 
 _DIAGONAL = np.arange(3)
 _KEEP = 5 * NANOSECONDS
@@ -110,7 +110,7 @@ class SensorAlignment(PlacedSensors[_Sensor]):
             self.counters["other_clock"] += 1
             return None
         source.forget_before(stamp - _KEEP)
-        if skeleton.covariances is not None:  # no Kinect
+        if skeleton.covariances is not None:  # not a Kinect, which states none
             self._sides.reliable.add(sensor)
         seen = _in_world(skeleton, stamp, pose)
         if source.newest is None or stamp > source.newest.stamp_ns:

@@ -37,7 +37,7 @@ _MARGIN = 0.3
 """... by this many metres in total."""
 
 _MERGE_DISTANCE = 0.35
-"""Two people nearer than this, whom no sensor sees both, are merged, metres: torsos do not come as close."""
+"""Two people nearer than this are merged unless one sensor sees both, metres: torsos do not come as close."""
 
 _OWN_STDDEV, _CROSS_STDDEV = 0.08, 0.2
 """Standard deviation of a torso against the same sensor's last frame, and against another sensor's, metres."""
@@ -89,7 +89,7 @@ def torso_points(positions: FloatArray) -> FloatArray:
 
 
 def torso_distances(ones: FloatArray, others: FloatArray) -> FloatArray:
-    """Distances between torsos: the (lower) median over the points that both have, else that of their centres.
+    """Distances between torsos: the lower median over their common points; without any, the distance of the centres.
 
     Args:
         ones: (n, 6, 3) metres, as of :func:`torso_points`.
@@ -181,7 +181,7 @@ def _min_cost_assignment() -> Callable[[FloatArray], tuple[IntArray, IntArray]]:
 
 
 def prepare() -> None:
-    """Import what assigns: half a second, too long for a second person's first frame."""
+    """Import the assignment solver: that takes half a second, too long for a second person's first frame."""
     _min_cost_assignment()
 
 
@@ -353,7 +353,7 @@ class Association:
     def _corrected(
         self, sensor: str, stamp_ns: int, points: FloatArray, whose: list[_Person | None]
     ) -> list[_Person | None]:
-        """The assignment, or the one by the other sensors' sightings where that has been better for long."""
+        """The assignment, or the one by the other sensors' sightings once it has been better for ``_CHANGE_NS``."""
         present = [
             (person, other)
             for person in self._people
@@ -389,7 +389,7 @@ class Association:
         return changed
 
     def _merge(self, sensor: str, stamp_ns: int, whose: Sequence[_Person | None]) -> None:
-        """Merge two people whom no sensor sees both and who have been in one place for long."""
+        """Merge two people who have been in one place for ``_CHANGE_NS`` while no sensor saw both."""
         for one, other, by in self._pairs(sensor, stamp_ns, whose):
             older, newer = sorted((one, other), key=lambda person: person.number)
             pair = older.number, newer.number
@@ -423,6 +423,6 @@ class Association:
                 if one is None or other in whose or other.age_ns(sensor, stamp_ns) <= _CHANGE_NS:
                     continue
                 by = other.by_others(sensor, stamp_ns)
-                # a sensor that sees both sees that they are two
+                # a sensor that sees both proves that they are two
                 if by is not None and other.age_ns(by, stamp_ns) <= _FRESH < one.age_ns(by, stamp_ns):
                     yield one, other, by

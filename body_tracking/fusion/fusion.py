@@ -183,9 +183,9 @@ class Fusion(PlacedSensors[_Sensor]):
             return False
         if sensor == self.reference:
             self._restart_behind(stamp, now_ns)
-        if skeleton.covariances is not None:  # no Kinect
+        if skeleton.covariances is not None:  # not a Kinect, which states none
             self._sides.reliable.add(sensor)
-        # Frames are remembered before the sensor is calibrated, so that it is known by then when its next one is due.
+        # Frames are stored before the sensor is calibrated, so that its frame period is known by then.
         self._remember(source, skeleton, stamp)
         if source.pose(stamp) is None:
             self.counters["uncalibrated"] += 1
@@ -197,9 +197,9 @@ class Fusion(PlacedSensors[_Sensor]):
         return True
 
     def _restart_behind(self, stamp: int, now_ns: int) -> None:
-        """Start the output again where the reference's frames are older than it for longer than a delay explains.
+        """Restart the output when the reference's frames have been over a second behind it for over a second.
 
-        The clock relation of another sensor may have been wrong, and the output far ahead.
+        A wrong clock relation of another sensor may have put the output far ahead.
         """
         if self._last_ns is None or self._last_ns <= stamp + JUMP_BACK_NS:
             self._behind_since_ns = None
@@ -222,7 +222,7 @@ class Fusion(PlacedSensors[_Sensor]):
             share = 1.0 - math.exp(-step / SMOOTHING)
             change = (positions - last.positions) / step
             velocities = last.velocities + share * (change - last.velocities)
-            fast = ~(np.abs(change).max(axis=1) < MAX_SPEED)  # and NaN; a label that jumps is faster than a limb
+            fast = ~(np.abs(change).max(axis=1) < MAX_SPEED)  # or NaN; only a label that jumps is so fast
             if fast.any():
                 velocities[fast] = 0.0
             since = last.since_ns
@@ -264,7 +264,7 @@ class Fusion(PlacedSensors[_Sensor]):
         return min((source.frames[0].since_ns for source in self._sensors.values() if source.frames), default=stamp)
 
     def _due(self, stamp: int) -> list[Rhythm]:
-        """Of the calibrated sensors whose frame captured up to a time is due and has not arrived."""
+        """Rhythms of the calibrated sensors whose frame captured up to a time is due and has not arrived."""
         due = []
         for source in self._sensors.values():
             if not source.frames or source.pose(stamp) is None:
@@ -348,8 +348,8 @@ class Fusion(PlacedSensors[_Sensor]):
         far = squared > GATE**2  # False for NaN
         if far.any() or self._rejecting:
             self._readmit(stamp, names, far)
-        # Both shoulders and both hips from the same sensors, or the axis between them means nothing. Those that agree
-        # with the accepted heading are not gated: the prediction lags behind a turn of the body.
+        # The shoulders, and the hips, are gated together: the axis between them needs both from the same sensors. Axes
+        # of plausible width that agree with the accepted heading are not gated: the prediction lags behind a turn.
         for half, (pair, (least, most)) in enumerate(zip(PAIRS, _WIDTHS, strict=True)):
             far[:, pair] |= far[:, pair[::-1]]
             width = np.linalg.norm(points[:, pair[0]] - points[:, pair[1]], axis=1)
@@ -391,7 +391,7 @@ class Fusion(PlacedSensors[_Sensor]):
         away = points - mean
         claimed = np.einsum("kj,kj,kj->j", share, share, variance)
         covariance = np.einsum("kj,kji,kjl->jil", share, away, away)
-        # Only the disagreement beyond the stated variance: for two sensors the larger of both along their difference.
+        # Add only the disagreement beyond the stated variance: along two sensors' difference the larger one results.
         spread = np.einsum("jii->j", covariance)
         covariance *= (np.maximum(spread - claimed, 0.0) / np.maximum(spread, 1e-12))[:, None, None]
         covariance[:, _DIAGONAL, _DIAGONAL] += claimed[:, None]

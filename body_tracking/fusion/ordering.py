@@ -140,7 +140,7 @@ class Ordering:
         return min([*next_ns, *(each.stamp_ns for each in self._waiting[:1])])
 
     def _due(self, stamp_ns: int) -> list[Rhythm]:
-        """Of the sensors whose frame captured up to a time is due and has not arrived."""
+        """Rhythms of the sensors whose frame captured up to a time is due and has not arrived."""
         return [
             source.rhythm
             for source in self._sources.values()

@@ -1,4 +1,4 @@
-"""Selection of the tracked people: one, the same in all sensors, or each under a number of their own.
+"""Selection of the tracked people: one person, the same in all sensors, or all, each with a number.
 
 Brings frames into world for :mod:`body_tracking.fusion.association`, and gives its people numbers.
 """
@@ -46,7 +46,7 @@ class Slots:
             people: all who are present, the longest known first.
 
         Returns:
-            The freed numbers, also where given to another person, and the count of people without a number.
+            The freed numbers, including those given to another person, and the count of people without a number.
         """
         gone = [person for person in self.of if person not in people]
         freed = [self.of.pop(person) for person in gone]
@@ -138,7 +138,7 @@ class People(PlacedSensors[_Sensor]):
             skeletons: the bodies in it, in the sensor's own frame and clock.
 
         Returns:
-            Numbers and bodies, the latter as they are given; with one subject at most one, with number 1.
+            Pairs of number and unchanged body; with one subject at most one pair, with number 1.
         """
         seen = [skeleton for skeleton in skeletons if skeleton.valid.any()]
         if not seen:
@@ -226,7 +226,7 @@ class People(PlacedSensors[_Sensor]):
 
 
 def _points(skeleton: Skeleton, pose: SensorPose) -> FloatArray:
-    """(25, 3) metres in world; NaN for what is not valid."""
+    """(25, 3) metres in world; NaN for joints that are not valid."""
     return pose.apply(np.where(skeleton.valid[:, None], skeleton.positions, np.nan))
 
 

@@ -47,7 +47,7 @@ class PeopleFusion:
 
     @property
     def parameters(self) -> FusionParameters:
-        """Of each fusion."""
+        """Parameters of each fusion."""
         return self._fusions[0].parameters
 
     @parameters.setter
@@ -94,7 +94,7 @@ class PeopleFusion:
         return _together(found + self._polled(now_ns) if self._several else found)
 
     def poll(self, now_ns: int) -> list[tuple[Skeleton, ...]]:
-        """The fused skeletons that need wait no longer."""
+        """The fused skeletons whose wait is over."""
         return _together(self._polled(now_ns))
 
     def _polled(self, now_ns: int) -> list[Skeleton]:

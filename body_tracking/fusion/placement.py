@@ -17,7 +17,7 @@ WORLD: Final = "world"
 """The usual frame of the output."""
 
 _MOST = 64
-"""Poses, and clocks, of one sensor that may wait to come into force."""
+"""Poses, and clocks, that are kept of one sensor."""
 
 
 class FusionError(BodyTrackingError):
@@ -35,7 +35,7 @@ class Placement:
     def clear(self) -> None:
         """Forget all frames."""
         self.newest_ns: int | None = None  # in the reference's clock
-        self.ahead = False  # the clock relation is wrong: the reference's frames are from this sensor's past
+        self.ahead = False  # over a second ahead of the reference's frames: the clock relation is wrong
 
     def set_pose(self, pose: SensorPose) -> None:
         """Add a pose, in force from its ``valid_from_ns``; it replaces earlier ones for later times."""
@@ -44,7 +44,7 @@ class Placement:
         del self._poses[:-_MOST]
 
     def set_clock(self, valid_from_ns: int, clock: ClockModel) -> None:
-        """Add a relation of the clocks, in force from a reference time, likewise."""
+        """Add a clock relation, in force from a reference time; it replaces earlier ones for later times."""
         del self._clocks[bisect_right(self._clocks, valid_from_ns, key=_first) :]
         self._clocks.append((valid_from_ns, clock))
         del self._clocks[:-_MOST]
@@ -60,7 +60,7 @@ class Placement:
         return found
 
     def stamp(self, sensor_ns: int) -> int | None:
-        """The same; None where the clock relation is wrong, so that the result is no ROS time."""
+        """As :meth:`to_reference`; None where the result is no ROS time, because the clock relation is wrong."""
         found = self.to_reference(sensor_ns)
         return found if 0 <= found <= MAX_STAMP_NS else None
 
@@ -70,7 +70,7 @@ class Placement:
         return self._poses[at - 1] if at else None
 
     def forget_before(self, now_ns: int) -> None:
-        """Drop poses and clocks that others have replaced by then."""
+        """Drop poses and clocks that are no longer in force at a reference time."""
         del self._poses[: max(0, bisect_right(self._poses, now_ns, key=_valid_from) - 1)]
         del self._clocks[: max(0, bisect_right(self._clocks, now_ns, key=_first) - 1)]
 
@@ -85,7 +85,7 @@ S = TypeVar("S", bound=Placement)
 
 
 class PlacedSensors(Generic[S]):
-    """Several sensors with their poses and clocks; who takes their frames derives from it.
+    """Several sensors with their poses and clocks: base of the classes that take their frames.
 
     Attributes:
         reference: the sensor whose clock is that of the output.
@@ -93,7 +93,7 @@ class PlacedSensors(Generic[S]):
     """
 
     def __init__(self, sensors: Sequence[str], reference: str | None, kind: type[S]) -> None:
-        """Without poses and clocks.
+        """Start without poses and clocks.
 
         Args:
             sensors: their names.

@@ -24,7 +24,7 @@ _CLOSE = math.sqrt(0.5)
 """Two sensors' headings agree where their cosine exceeds this."""
 
 _AGREES = math.cos(math.radians(30.0))
-"""Cosine of the largest angle between a measured left-right axis and the accepted one that agrees with it."""
+"""Cosine of the largest angle at which a measured left-right axis agrees with the accepted one."""
 
 HEADING_DRIFT = 1.6
 """Spectral density of a person's turning, as a random walk of the heading, rad2/s."""
@@ -60,7 +60,7 @@ JUMP = math.radians(20.0)
 """Radians beyond ``TURN_RATE`` by which an axis that one sensor sees must turn between two frames to be an outlier."""
 
 JUMP_WIDTH = 1.3
-"""Factor by which an outlier's axis must also become longer or shorter: then one of its two joints is misplaced."""
+"""Factor by which an outlier's axis must also lengthen or shorten: a misplaced end changes its length."""
 
 JUMP_HOLD = 0.3
 """Seconds after which a new heading and width is accepted."""
@@ -77,7 +77,7 @@ class _Heading:
         self._variance += HEADING_DRIFT * max(elapsed, 0.0)
 
     def innovation(self, angle: float) -> float:
-        """Innovation of a line's direction, radians within a quarter turn: it has no sense."""
+        """Innovation of a line's direction, radians within a quarter turn: a line has no sense."""
         return math.remainder(angle - self.angle, math.pi)
 
     def update(self, angles: Sequence[float], weights: Sequence[float]) -> float:
@@ -121,8 +121,8 @@ class Sides:
         hold: longest time for which a reversal that all sensors see at once is rejected, seconds.
 
     Attributes:
-        reliable: sensors whose left and right are right from behind, too, unlike a Kinect's: a reversal that they see
-            is rejected for no longer than :data:`MIN_HOLD`.
+        reliable: sensors that tell left from right also from behind, unlike a Kinect: a reversal that they see is
+            rejected for no longer than :data:`MIN_HOLD`.
     """
 
     def __init__(self, hold: float = HOLD) -> None:
@@ -138,7 +138,7 @@ class Sides:
         self._better_since: int | None = None
         self._halves = [_Heading(math.nan), _Heading(math.nan)]
         self._headings_ns: int | None = None
-        self._known_since = 0  # without having been reversed
+        self._known_since = 0  # start of the time without a reversal
         self._reversed_since: int | None = None
         self._views: dict[str, _View] = {}
         # the latest heading, width and stamp, by sensor and half
@@ -319,12 +319,12 @@ class Sides:
     def _reversal_accepted(
         self, stamp: int, leading: int, senses: Mapping[int, float], angle: float, *, reliable: bool
     ) -> bool:
-        """Whether the estimate was reversed, now that the trusted sensor sees the body reversed.
+        """Whether to reverse the estimate, because the trusted sensor sees the body reversed.
 
         No person reverses between two frames, so the sensor errs now or has erred until now. While at least as many
         sensors keep the old sense as see the reversal, it errs now. Otherwise the reversal is accepted when it has
-        lasted as long as the sense that it contradicts, because sensors err for less time than they do not. A body seen
-        from the front counts as seen for long: sensors seldom mistake a back for a front.
+        lasted as long as the sense that it contradicts, because sensors are wrong for less time than they are right. A
+        body seen from the front counts as seen for long: sensors seldom mistake a back for a front.
         """
         as_before = sum(sense > _CLOSE for sense in senses.values())
         with_it = sum(sense < -_CLOSE for index, sense in senses.items() if index != leading)
