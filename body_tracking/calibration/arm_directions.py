@@ -1,7 +1,7 @@
 """Directions of the arms of a Kinect v2 against anatomical ones, as a function of the arm's pose.
 
-A Kinect v2 overstates a lifted arm's elevation towards the side, understates it backward, and has elbows 6 to 10
-degrees too straight, alike for everybody. With unit directions ``u`` of the upper arm and ``f`` of the forearm in the
+A Kinect v2 overstates a lifted arm's elevation towards the side, understates it backward, and sees elbows 6 to 10
+degrees too straight, in everybody. With unit directions ``u`` of the upper arm and ``f`` of the forearm in the
 axes of the thorax (forward, left, up; of a right arm, a left one mirrored), the anatomical ones are
 
     u' ~ u + U (1, u),   f' ~ f + F (1, u, f)                                                                       (1)
@@ -10,8 +10,8 @@ each normalised. ``U`` (3, 4) and ``F`` (3, 7) are the ridge regression of the d
 
     W = D^T X (X^T X + r I)^-1                                                                                      (2)
 
-with rows of ``X`` and ``D`` for each frame, weighted so that each subject, and each clip of a subject, weighs alike and
-all weigh one together (Hoerl and Kennard 1970). Eq. (1) has an exact inverse: with ``u + A u + b = s u'`` and
+with rows of ``X`` and ``D`` for each frame (Hoerl and Kennard 1970). All subjects have equal weights, likewise all
+clips of a subject, and the weights sum to one. Eq. (1) has an exact inverse: with ``u + A u + b = s u'`` and
 ``|u| = 1``, ``u = s p - q``, ``p = (I + A)^-1 u'``, ``q = (I + A)^-1 b``, and ``s`` is the greater root of
 ``|s p - q|^2 = 1``. The simulated Kinect errs by this inverse.
 """
@@ -50,7 +50,7 @@ Directions = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmLaw:
-    """Eq. (1).
+    """The coefficients of eq. (1).
 
     Attributes:
         upper: (3, 4) ``U``.
@@ -82,8 +82,8 @@ KINECT_V2: Final = ArmLaw(
         ]
     ),
 )
-"""Fitted to 48 clips of shoulder exercises of five people (UI-PRMD, Vakanski et al. 2018), those whose time warp
-explains 0.9: ``benchmarks/kinect_vs_vicon.py --fit``."""
+"""Fitted to 48 clips of shoulder exercises of five people (UI-PRMD, Vakanski et al. 2018), those in which the time warp
+explains at least 0.9 of the variance: ``benchmarks/kinect_vs_vicon.py --fit``."""
 
 
 def corrected_arms(skeleton: Skeleton, law: ArmLaw = KINECT_V2) -> Skeleton:
@@ -99,7 +99,7 @@ def corrected_arms(skeleton: Skeleton, law: ArmLaw = KINECT_V2) -> Skeleton:
 
 
 def fit_arm_law(clips: Sequence[tuple[str, FloatArray, FloatArray]], ridge: float = RIDGE) -> ArmLaw:
-    """Eq. (2).
+    """Fit the coefficients by the ridge regression of eq. (2).
 
     Args:
         clips: subject, and (n, 2, 3) unit directions of upper arm and forearm, measured and anatomical, of the right

@@ -51,8 +51,8 @@ class OffsetEstimate:
     Attributes:
         offset: seconds.
         correlation: normalised correlation of the joint speeds at that offset, -1 to 1.
-        likely: correlation of the same likelihood at the guess itself: smaller for an offset far from it and for little
-            motion.
+        likely: correlation that would be equally probable at the guess: smaller than ``correlation`` for an offset far
+            from the guess, and for little motion.
         margin: difference of ``likely`` to the best offset more than 0.3 s away.
     """
 
@@ -70,7 +70,7 @@ def joint_speeds(stamps: FloatArray, positions: FloatArray) -> Series:
         positions: (n, 25, 3) metres; NaN where not known.
 
     Returns:
-        Of n - 4 times; empty where there are not enough frames.
+        Speeds at n - 4 times; empty where there are not enough frames.
     """
     if len(stamps) < 2 * _SPAN:
         return Series(np.empty(0), np.empty((0, len(_LIMB_JOINTS))), np.empty(0, dtype=np.bool_))
@@ -104,7 +104,7 @@ def correlate_clocks(
 
     Args:
         reference: stamps (n,) seconds ascending, positions (n, 25, 3) metres.
-        sensor: the same of the other sensor, in its own clock and frame.
+        sensor: stamps and positions of the other sensor, in its own clock and frame.
         guess: sensor clock minus reference clock, seconds, known to within ``window``.
         window: half width of the search, seconds.
 
@@ -125,6 +125,6 @@ def correlate_clocks(
     best = int(np.argmax(likely))
     far = np.abs(lag - lag[best]) > 0.3
     margin = float(likely[best] - likely[far].max()) if far.any() else 0.0
-    # The preference chooses the peak and must not move it.
+    # The prior selects the peak and must not shift it.
     peak = int(np.argmax(np.where(np.abs(lag - lag[best]) <= 0.1, score, -np.inf)))
     return OffsetEstimate(guess + float(lag[peak]), float(score[peak]), float(likely[best]), margin)

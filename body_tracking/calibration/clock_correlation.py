@@ -1,7 +1,7 @@
 """Offset and drift of a clock from a motion measured in it and in a reference clock.
 
-Two series of how fast something moves are compared at every offset of a window (:func:`correlate`), and windows of
-motion around a known offset are fitted with a line, offset plus drift (:class:`ClockFit`).
+Two series of speeds are compared at every offset of a window (:func:`correlate`), and windows of motion around a known
+offset are fitted with a line, offset plus drift (:class:`ClockFit`).
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Series:
 
     Attributes:
         stamps: (n,) seconds, ascending.
-        values: (n, k) of k things.
+        values: (n, k) of k signals, such as joints.
         good: (n,) where they are known.
         longest_gap: seconds between samples over which values are interpolated.
     """
@@ -188,7 +188,7 @@ class ClockFit:
         Args:
             elapsed: reference time of its middle since ``zero_ns``, seconds.
             reference: the window.
-            sensor: the other series, by the clock of the base, in the window and its surroundings.
+            sensor: the other series over the window and its surroundings, converted by the base's clock.
 
         Returns:
             Whether the window was used: enough overlap and motion.
@@ -196,7 +196,7 @@ class ClockFit:
         if len(reference.stamps) < 2 or len(sensor.stamps) < 2:
             return False
         sampled = [sensor.at(reference.stamps + lag) for lag in _LAGS]
-        # The same frames at every lag, so that their number does not decide.
+        # The same frames at every lag, so that their number does not change the likelihood.
         both = reference.good & np.logical_and.reduce([known for _, known in sampled])
         step = float(np.median(np.diff(reference.stamps)))
         seconds = float(both.sum() * step)
@@ -272,7 +272,7 @@ class ClockFit:
             gradient = np.array([g.sum(), g @ elapsed])
             off = trust * (line[0] + line[1] * at - line0[0])
             draws = gradient - np.array([off, off * at + drift_trust * (line[1] - line0[1])])
-            # Between the points of the grid it can bend upwards: uphill even so.
+            # Between the grid's points the likelihood can be convex: absolute curvatures make the step go uphill.
             curvatures, axes = np.linalg.eigh(line_information(elapsed, -h) + bounds)
             step = axes @ ((axes.T @ draws) / np.maximum(np.abs(curvatures), 1e-9))
             step *= min(1.0, 0.5 * PEAK_WIDTH / max(abs(step[0]), 1e-12), _DRIFT_STEP / max(abs(step[1]), 1e-12))
@@ -282,8 +282,8 @@ class ClockFit:
         if abs(line[0]) >= FINE_RANGE - PEAK_WIDTH or abs(line[1]) > drifts[-1]:
             return None
         motion = line_information(elapsed, -on(line, bend))
-        # An error common to all windows, of the variance T / like times that of the offset by the motion, by the
-        # formula of Sherman and Morrison; the prior gains the weight that the motion loses.
+        # An error common to all windows has T / like times the variance of the offset by the motion. It is added by the
+        # Sherman-Morrison formula; the prior gains the weight that the motion loses.
         share = np.zeros(2)
         if motion[0, 0] > 0.0:
             share = motion[0] / (motion[0, 0] * (1.0 + self._like / float(sums[:, 3, 0].sum())))

@@ -57,7 +57,7 @@ class Coverage:
         self._added += 1
 
     def _place(self, reference: FloatArray) -> IntArray:
-        """(3,) of place across, place along the view, sector of the heading; optical frame, so y is up and down."""
+        """(3,) indices of place across the view, place along it, and sector of the heading; optical frame, y down."""
         centre, axis = reference[Joint.SPINE_BASE], body_heading(reference)
         sector = np.arctan2(axis[2], axis[0]) / (2 * np.pi) * HEADINGS
         key = np.array([centre[0] / PLACE_SIZE, centre[2] / PLACE_SIZE, sector])

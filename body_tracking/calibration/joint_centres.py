@@ -27,8 +27,8 @@ and from the elbow on ``d`` is multiplied, with the elbow bent by ``beta``, by
 
     1 - (1 - cos(beta))^2  up to a right angle, 0 beyond                                                           (4)
 
-because a camera's error of a bent elbow is another one: the same Kinect has the same person's elbow bent more by 7
-degrees, not less by 13, where it is bent by 67.
+because the error differs at a bent elbow: in the same person the same Kinect overstates 67 degrees of flexion by 7
+degrees, but understates that of the stretched arm by 13.
 
 Over 500 lines: one estimator with its derivation; its steps share their notation.
 """
@@ -63,7 +63,7 @@ _FOLLOWERS = {
     _J.HAND_LEFT: (_J.HAND_TIP_LEFT, _J.THUMB_LEFT),
     _J.HAND_RIGHT: (_J.HAND_TIP_RIGHT, _J.THUMB_RIGHT),
 }
-"""Joints with the offset of the one that they follow."""
+"""Joints that get the offset of another one, by the latter."""
 _MOVED = np.array([*LEARNT, *(each for joint in _FOLLOWERS for each in _FOLLOWERS[joint])], dtype=np.intp)
 _MOVED_AS = np.array(
     [*range(len(LEARNT)), *(_PLACE[joint] for joint in _FOLLOWERS for _ in _FOLLOWERS[joint])], dtype=np.intp
@@ -84,7 +84,7 @@ _MAX_MOTION = 0.025
 _CHECK_NS, _CHECK_AGAIN_NS = NANOSECONDS // 5, 2 * NANOSECONDS
 """Time to the next check of a sensor's frames for a T-pose: without one, and after one that was used."""
 _BREAK_NS, _LATE_NS = NANOSECONDS // 3, NANOSECONDS // 2
-"""Longest interval between frames of one pose; delay of a stamp from which time jumped back."""
+"""Longest interval between frames of one pose; delay of a stamp from which it is a backward jump of time."""
 _ANOTHER_NS = 2 * _CHECK_AGAIN_NS
 """Interval from which held poses count as two."""
 _FADE_IN = 0.3
@@ -94,8 +94,8 @@ _GATE_QUANTILE = 0.999
 POSE_STDDEV = math.radians(6.0)
 """Radians: standard deviation of a person's T-pose, per axis of a joint."""
 _STRAIGHT_ELBOW = math.radians(4.0)
-"""Radians: mean and standard deviation of the forward flexion of elbows in a T-pose with palms down. Their limit is 0.6
-+- 3.1 degrees (Boone and Azen 1979)."""
+"""Radians: mean and standard deviation of the forward flexion of elbows in a T-pose with palms down. The limit of
+extension is 0.6 +- 3.1 degrees (Boone and Azen 1979)."""
 _SYMMETRY_STDDEV = 0.01
 """Metres: standard deviation of the difference between left and right of bones and of their joints."""
 _ROLL_STDDEV = math.radians(40.0)
@@ -182,7 +182,8 @@ def posed(positions: FloatArray, local: FloatArray) -> FloatArray:
         local: (11, k, 3) vectors in the frame of the segment that ends in each of the joints ``LEARNT``.
 
     Returns:
-        (11, k, 3) likewise; NaN where the thorax is unknown. An unknown bone is replaced by the one before it.
+        (11, k, 3) vectors in the axes of the positions; NaN where the thorax is unknown. An unknown bone is replaced by
+        the one before it.
     """
     points = positions.take(LEARNT, axis=0).tolist()
     _, middle, top, *arms = points
@@ -294,11 +295,11 @@ def _t_pose(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, Flo
     for sign, arm, other in ((1.0, _LEFT, _RIGHT), (-1.0, _RIGHT, _LEFT)):
         shoulder, elbow, wrist, hand = arm
         upper, fore, palm = length(shoulder, elbow), length(elbow, wrist), length(wrist, hand)
-        # plane of elevation: the upper arm goes on along the line of the shoulders
+        # plane of elevation: the upper arm continues the line of the shoulders
         ratio = upper / width
         terms = (elbow, 1.0), (shoulder, -1.0 - ratio), (other[0], ratio)
         angles.append(add_row(forward, 0.0, upper * POSE_STDDEV, *terms))
-        # elevation: at a right angle to the thorax, which leans by how its ends are off sideways
+        # elevation: perpendicular to the thorax, whose lean follows from the sideways offsets of its ends
         row = add_row(up, 0.0, upper * POSE_STDDEV, (elbow, 1.0), (shoulder, -1.0)).copy()
         row[_PLACE[top], left], row[_PLACE[middle], left] = sign * upper / thorax, -sign * upper / thorax
         angles.append(row)
@@ -451,7 +452,7 @@ class JointCentres:
         return 1.0 - math.exp(min(0.0, (since_ns - stamp_ns) / (_FADE_IN * NANOSECONDS)))
 
     def _in_force(self, stamp_ns: int) -> FloatArray:
-        """(11, 3) metres, in the frames of the segments."""
+        """(11, 3) metres: the offsets to subtract, in the frames of the segments."""
         if self.offsets is None:
             return self._before
         return self._before + self._progress(self._since_ns, stamp_ns) * (self.offsets.local - self._before)
@@ -461,7 +462,7 @@ class JointCentres:
 
         Args:
             positions: (25, 3) metres, as measured.
-            measured: (25,) which are.
+            measured: (25,) whether each joint is measured.
             stamp_ns: capture time.
 
         Returns:
@@ -516,7 +517,7 @@ def _in_body_axes(skeletons: list[Skeleton]) -> tuple[FloatArray, FloatArray]:
 
 
 def _offsets(sensors: list[_Evidence]) -> Offsets | None:
-    """By all sensors' frames, weighted by their stated precision; None where a joint of trunk or arms is missing."""
+    """Offsets from all sensors' frames, weighted by stated precision; None if a joint of trunk or arms is missing."""
     precision, total = np.zeros(len(LEARNT)), np.zeros((len(LEARNT), 3))
     for each in sensors:
         seen = each.counts > 0.0

@@ -1,12 +1,11 @@
-"""Where a Kinect v2 sees the spine: behind the centres of its joints, alike for everybody.
+"""Correction of a Kinect v2's spine, whose joints lie behind the anatomical ones in everybody.
 
 The skeleton of the SDK has SpineBase 36 mm behind the middle of the hips and level with it: 35.5 to 37.7 mm in each of
-five people (UI-PRMD), 34 to 38 in eight of nine recordings of three others, 48 in the ninth; 4 mm below to 4 above. In
-a body the joint of the lumbar spine lies
-above the middle of the hip joints. Taken for it, the Kinect's SpineBase tilts the pelvis of an upright person backward,
-so that the trunk seems to be bent forward against it by 15 to 21 degrees. SpineShoulder lies 27 mm farther behind the
-shoulders than by Vicon (UI-PRMD, five people); Schlagenhauf (2017), table E.1, has all of the spine 31 to 62 mm behind
-and its base 30 mm below the anatomical joints.
+five people (UI-PRMD), 34 to 38 in eight of nine recordings of three others, 48 in the ninth; 4 mm below to 4 above. The
+anatomical joint of the lumbar spine lies above the middle of the hip joints. With the Kinect's SpineBase in its place,
+the pelvis of an upright person tilts backward, and the trunk seems to be bent forward by 15 to 21 degrees.
+SpineShoulder lies 27 mm farther behind the shoulders than by Vicon (UI-PRMD, five people); Schlagenhauf (2017), table
+E.1, has all of the spine 31 to 62 mm behind and its base 30 mm below the anatomical joints.
 
 So SpineBase is moved forward and up in the axes of the pelvis. The joints above it are moved forward in the axes of the
 thorax, all by one distance: the thorax keeps its direction, on which the law of the arms (`arm_directions`) rests.
@@ -39,11 +38,11 @@ _NEEDED: Final[IntArray] = np.array(
 
 
 def corrected_kinect(skeleton: Skeleton, law: ArmLaw = KINECT_V2) -> Skeleton:
-    """A skeleton of a Kinect v2 without the errors that all of them share, those of the arms and of the spine.
+    """A skeleton of a Kinect v2 without the systematic errors of arms and spine that all Kinects v2 share.
 
     Args:
         skeleton: in any frame; only its positions change.
-        law: of the directions of the arms.
+        law: corrects the directions of the arms.
     """
     return corrected_spine(corrected_arms(skeleton, law))
 
@@ -51,8 +50,8 @@ def corrected_kinect(skeleton: Skeleton, law: ArmLaw = KINECT_V2) -> Skeleton:
 def corrected_spine(skeleton: Skeleton) -> Skeleton:
     """A skeleton of a Kinect v2 with the spine at the centres of its joints.
 
-    A sensor's own frame is corrected before its left and right are swapped, since the Kinect places the spine behind
-    what it takes for the front; a fused frame, whose sides fusion has corrected, as it is.
+    A sensor's own frame must be corrected before its left and right are swapped, since the Kinect places the spine
+    behind the side that it takes for the front. A fused frame has correct sides already.
 
     Args:
         skeleton: in any frame; only its positions change, and only where both axes of the pelvis, or of the thorax, are

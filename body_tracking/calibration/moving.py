@@ -1,4 +1,4 @@
-"""Moving sums and minima, in numpy: ``scipy.ndimage`` has them, and takes the node ``calibration`` 0.4 s to import."""
+"""Moving sums and minima in numpy: importing ``scipy.ndimage`` for them takes the node ``calibration`` 0.4 s."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from body_tracking.core.skeleton import BoolArray, FloatArray
 
 
 def weighted(values: FloatArray, weights: Sequence[float] | FloatArray) -> FloatArray:
-    """The weighted sums over a window along the last axis; what lies beyond an end is like the end.
+    """The weighted sums over a window along the last axis; beyond the ends, the end values are repeated.
 
     Args:
         values: (..., n).

@@ -32,8 +32,8 @@ PAIR_PERIOD = 0.1
 """Seconds of reference time between stored pairs: errors of frames closer together are correlated."""
 
 MAX_BRACKET = 0.15
-"""Longest interval between two frames of a sensor for interpolation, seconds: of a camera of seven images a second. A
-limb that brakes by 5 m/s2 then errs by 14 mm in the middle, no more than the joints' noise."""
+"""Longest interval between two frames of a sensor for interpolation, seconds: that of a camera with seven images per
+second. For a limb that brakes by 5 m/s2 the error is 14 mm in the middle, no more than the joints' noise."""
 
 GUESS_FRAMES = 30
 """Frames of a sensor whose delay of receipt gives the first guess of its clock."""
@@ -143,7 +143,7 @@ class _Track:
         self.positions: list[FloatArray] = []
         self.states: list[np.ndarray] = []
         self.variances: list[FloatArray] = []
-        self.delays: list[int] = []  # receipt less stamp
+        self.delays: list[int] = []  # receipt minus stamp
         self.late = 0
 
     def push(self, skeleton: Skeleton, received_ns: int) -> bool:
@@ -218,10 +218,10 @@ class _Sensor:
         self.clock = replace(self.clock, stddev=np.inf, drift_stddev_ppm=np.inf)
         self.clock_guessed = False
         self.clock_saved = False
-        self.clock_expected: ClockModel | None = None  # from before the motion that the fit has seen
+        self.clock_expected: ClockModel | None = None  # prior: from before the motion that the fit uses
         self.received: ClockModel | None = None  # by the times of receipt
         self.clock_locked = False
-        self.clock_base = self.clock  # what the fit is relative to
+        self.clock_base = self.clock  # of the fit
         self.clock_fit: ClockFit | None = None
         self.clock_window_end: int | None = None
         self.paired_clock = self.clock
@@ -374,7 +374,7 @@ class OnlineCalibration:
             other.clock = ClockModel(round(offset * NANOSECONDS), 0.0, self._anchor)
             other.loaded = None
         elif other.loaded is None:
-            other.clock_saved = True  # of this session, whose motion is not to count twice
+            other.clock_saved = True  # of this session: no prior, or its motion would count twice
         else:
             other.clock = other.clock_expected = self._at_session_start(other.loaded)
             other.clock_saved = other.clock.stddev < RECEIPT_PRIOR
@@ -387,7 +387,7 @@ class OnlineCalibration:
         return loaded.carried_to(self._anchor, WANDER_PPM)
 
     def _clock_from_receipt(self, name: str, other: _Sensor, horizon: int) -> None:
-        """Replace the guess by the median delays over some seconds, of the frames that both sensors took in them."""
+        """Replace the guess by the difference of both sensors' median delays over the same few seconds."""
         stamps = other.track.stamps
         start = bisect_left(stamps, other.clock.to_sensor(self._track.stamps[0]))
         stop = start + RECEIPT_FRAMES - 1
@@ -462,7 +462,7 @@ class OnlineCalibration:
                 other.quality = SensorQuality(residual=residual, frames=FRAMES)
                 self._set_target(other, rotation, translation, np.nanmean(own[1], axis=(0, 1)))
         elif self.parameters.method == "robust" and self._can_start_from_movement(other, horizon):
-            # Without a still pose the movement itself is a start.
+            # Without a still pose, start from the movement.
             start = registration(other.pairs.pairs())
             if start is not None:
                 self.events.append(f"{name}: calibrated from motion without a still pose")
@@ -486,8 +486,8 @@ class OnlineCalibration:
             self._drop_saved_clock(name, other)
         other.clock_locked = True
         other.movement_since = self._now
-        # A few seconds of a twist seen from its side give an offset that is up to 60 ms wrong. One that the times of
-        # receipt do not exclude is left to the fit, which weighs both.
+        # A few seconds of a twist seen from its side give an offset that is up to 60 ms wrong. Unless the times of
+        # receipt exclude the old offset, the fit decides, which weighs both.
         if other.clock_expected is None and abs(found.offset) > RECEIPT_EXCLUDES:
             self.events.append(f"{name}: clock offset {other.clock_base.offset:+.2f} s found from the motion")
             other.clock = other.clock_base
@@ -500,7 +500,7 @@ class OnlineCalibration:
     def _since_anchor(
         self, track: _Track, clock: ClockModel, start: int | None, stop: int
     ) -> tuple[FloatArray, FloatArray]:
-        """Of the frames in (start, stop] of a clock: reference seconds (n,) since the anchor, and positions."""
+        """Reference seconds (n,) since the anchor and positions of the frames in (start, stop] of a sensor's clock."""
         # Differences first: a float has too few digits for microseconds since the epoch.
         first = 0 if start is None else bisect_right(track.stamps, start)
         last = bisect_right(track.stamps, stop)
@@ -514,7 +514,7 @@ class OnlineCalibration:
         other.loaded = other.clock_expected = None
 
     def _fitted_clock(self, name: str, other: _Sensor, fit: ClockFit) -> ClockModel | None:
-        """The clock by all the motion so far and the expected clock, unless these contradict each other."""
+        """The clock from all the motion so far and from the expected clock, unless these contradict each other."""
         found, expected = fit.solve(other.received), other.clock_expected
         if found is None or expected is None:
             return found
@@ -606,7 +606,7 @@ class OnlineCalibration:
         return self._track.stamps[0] <= oldest and other.track.stamps[0] <= other.clock.to_sensor(oldest)
 
     def _best(self, pairs: Pairs, other: _Sensor) -> PairEstimate | None:
-        """The best from three starts: the last estimate, half a turn from it, and the spines, which have no sides."""
+        """The best from three starts: the last estimate, half a turn from it, and the spines without left and right."""
         assert other.started is not None
         starts = [other.started]
         midline = start_from_midline(pairs)

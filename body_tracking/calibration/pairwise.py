@@ -1,10 +1,10 @@
 """The pose of one sensor against another, from a moving person.
 
 The systematic error of a Kinect skeleton depends on the viewing direction and is constant while a person stands and
-faces the same way, so that averaging more frames of one pose does not reduce it. The estimator therefore
-has an unknown constant offset per joint in addition to the pose. Offsets and pose are ambiguous for a still person, and
-the stated uncertainty is large; motion separates them. Offsets average out over places and headings, so their prior
-variance falls with the number of these.
+faces the same way, so that averaging more frames of one pose does not reduce it. The estimator therefore has an unknown
+constant offset per joint in addition to the pose. Offsets and pose are ambiguous for a still person, and the stated
+uncertainty is large; motion separates them. Offsets average out over places and headings, so their prior variance falls
+with the number of these.
 """
 
 from __future__ import annotations

@@ -17,9 +17,9 @@ def rigid_registration(
 ) -> tuple[FloatArray, FloatArray]:
     """Weighted least-squares rotation and translation with ``target = R source + t``.
 
-    The singular value decomposition of Schlagenhauf 2017 (eq. 5.1-5.7) with the two things that its equations lack:
-    the rotation that belongs to eq. 5.1 (5.4-5.6 give its inverse) and the check of the determinant, without which an
-    almost flat T-pose comes out as a reflection (Umeyama 1991, eq. 39-43). So it is Gaschler 2011, eq. 3.15-3.20.
+    The singular value decomposition of Schlagenhauf 2017 (eq. 5.1-5.7) with two corrections: the rotation of eq. 5.1
+    (eq. 5.4-5.6 give its inverse), and the sign of the determinant, without which an almost flat T-pose may give a
+    reflection (Umeyama 1991, eq. 39-43). The result equals Gaschler 2011, eq. 3.15-3.20.
 
     Args:
         target: (n, 3) metres.

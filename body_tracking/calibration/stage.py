@@ -69,7 +69,7 @@ class CalibrationStage(Stage):
         self._sensors = {graph.skeleton_topic(sensor): sensor for sensor in sensors}
         self.inputs = tuple(skeleton_input(topic, values) for topic in self._sensors)
         world = str(values["world_frame"])
-        # Two batches: who comes late needs the one in force while the latest one is in force only later.
+        # Two batches: a late subscriber needs the one in force until the latest one comes into force.
         kept = Qos(LATCHED.reliability, LATCHED.durability, 2 * max(1, len(sensors)))
         self.outputs = (
             Port(graph.CALIBRATION_CLOCK, Clock(), kept),
@@ -85,7 +85,7 @@ class CalibrationStage(Stage):
 
     def start(self, now: Now) -> Iterable[Output]:
         update = self.calibration.current_update()
-        # Valid for all times: without the drift of an earlier session, which the time since 1970 would make minutes.
+        # Valid for all times, so without the drift of an earlier session: far from its anchor it would add up.
         clocks = {sensor: replace(clock, drift_ppm=0.0) for sensor, clock in update.result.clocks.items()}
         return self._published([replace(update, result=replace(update.result, clocks=clocks))])
 
@@ -103,7 +103,7 @@ class CalibrationStage(Stage):
     def _published(self, updates: Iterable[CalibrationUpdate]) -> Iterator[Output]:
         for update in updates:
             result = update.result
-            # Clocks first: with a pose comes the first use.
+            # Clocks first: a subscriber uses a sensor as soon as it has the pose.
             for sensor, clock in result.clocks.items():
                 if sensor != result.reference:
                     yield Output(graph.CALIBRATION_CLOCK, SensorClock(sensor, update.valid_from_ns, clock))
@@ -112,7 +112,7 @@ class CalibrationStage(Stage):
             yield Output(TF_STATIC, tuple(result.poses.values()))
 
     def reset(self, topic: str) -> None:
-        """The calibration itself sees the jump in the stamps; only who the subject is may have changed."""
+        """Forget the subjects; the calibration itself detects the jump in the stamps."""
         for subject in self._subjects.values():
             subject.reset()
 
@@ -122,6 +122,6 @@ class CalibrationStage(Stage):
     def save(self) -> None:
         """Write the file, if anything changed."""
         if self._file is not None and self._unsaved:
-            # What is published, not the estimate that it still moves toward: a restart must not jump.
+            # The published poses, not the estimates toward which they still slew: a restart must not jump.
             save(self.calibration.current_update().result, self._file)
             self._unsaved = False

@@ -15,7 +15,7 @@ STILL_DRIFT = 0.035
 error drifts by a few centimetres."""
 
 STILL_STDDEV = 0.06
-"""... and largest standard deviation of four of five joints, metres."""
+"""... and largest 80 % quantile of the joints' standard deviations, metres."""
 
 LONGEST = 5.0
 """Longest duration of the fifty frames, seconds."""
@@ -43,7 +43,8 @@ def is_t_pose(positions: FloatArray) -> bool:
     """Whether both arms are stretched out sideways, on average.
 
     Args:
-        positions: (n, 25, 3) metres, any frame, NaN where unknown; False where a joint of the arms always is.
+        positions: (n, 25, 3) metres, any frame, NaN where unknown. The result is False if a joint of the arms is
+            unknown in all frames.
     """
     known = np.isfinite(positions)
     with np.errstate(invalid="ignore"):
@@ -70,7 +71,7 @@ def still_pose_registration(
 
     Args:
         reference: positions (n, 25, 3) metres and states (n, 25) of the reference sensor.
-        sensor: the same of the other.
+        sensor: positions and states of the other sensor.
 
     Returns:
         R (3, 3) and t (3,) metres that take the sensor's coordinates into the reference's (eq. 5.1), and the mean

@@ -49,15 +49,15 @@ def registration(pairs: Pairs) -> Pose | None:
 
 
 def half_turn_from(pairs: Pairs, rotation: FloatArray) -> Pose | None:
-    """The pose with which each frame has the opposite left and right than with a given one."""
+    """The registration under which each frame's left and right are opposite to those under a given rotation."""
     return registration(with_sides_swapped(pairs, same_sense(pairs.reference, pairs.sensor @ rotation.T)))
 
 
 def best_estimate(pairs: Pairs, starts: Iterable[Pose]) -> PairEstimate | None:
     """The best of the estimates from several starts, one of which should be half a turn from another.
 
-    The cost of each is over all frames, with left and right swapped where the sensors disagree about them, so that
-    reversed frames count, too, and :data:`DISAGREEMENT` for each of these.
+    The cost of each is over all frames, with left and right swapped where the sensors disagree about them, plus
+    :data:`DISAGREEMENT` for each such frame.
 
     Args:
         pairs: at least ten.
