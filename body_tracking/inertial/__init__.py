@@ -4,9 +4,8 @@
 estimates the rotation between sensor and segment, and ``heading`` tracks it and every sensor's heading over time.
 ``held_pose`` detects a pose for the alignment, ``mounting`` has the intended mountings, ``detection`` finds exchanged
 and slipped sensors. ``clock`` estimates a clock's offset by motion, ``timing`` keeps the offsets of all. ``posture``
-fits the body model to orientations, ``body`` makes a skeleton. ``tracking`` with its
-``parameters`` puts these together for ``stage``. ``simulated`` and its helpers simulate sensors; ``imu_csv`` and
-``mvnx`` read recordings.
+fits the body model to orientations, ``body`` makes a skeleton. ``tracking`` with its ``parameters`` combines these for
+``stage``. ``simulated`` and its helpers simulate sensors; ``imu_csv`` and ``mvnx`` read recordings.
 
 Frames: *sensor*, that of the chip; *earth*, level with z up and a heading of its own for each sensor; *segment*, that
 of ``UpperBody``; *world*. With the alignment A (segment to sensor) and the heading psi (about z, earth to world)::

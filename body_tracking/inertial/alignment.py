@@ -1,13 +1,13 @@
 """Alignment of inertial sensors with their segments by a held pose.
 
-In a known pose, R_pose of eq. 1 is given. Sensors that each have a heading of their own leave four unknowns
+A known pose gives R_world_segment = R_pose in eq. 1. Sensors that each have a heading of their own leave four unknowns
 for its three equations; the intended mounting, or headings known from elsewhere, determine the fourth. The most
 probable alignment A = A_0 exp(delta) and heading psi minimise, weighted by their covariances,
 
     log(R_pose^T Rz(psi) R_es A),  log(A_intended^T A),  psi - psi_known                                            (4)
 
-People hold a pose to within 5-10 degrees per axis of a segment; static calibrations of the upper limb compared by
-Bouvier et al., Sensors 15 (2015) 18813. One person repeats a pose to 2 degrees, people differ by far more (Donaldson
+People hold a pose to within 5-10 degrees per axis of a segment (static calibrations of the upper limb, compared by
+Bouvier et al., Sensors 15 (2015) 18813). One person repeats a pose to 2 degrees, people differ by far more (Donaldson
 et al., ISBS 39 (2021) 58): longer averaging does not reduce this error. See :func:`pose_covariance`.
 """
 
@@ -27,7 +27,7 @@ from body_tracking.kinematics.upper_body import UpperBody
 Pose = Literal["t", "n"]
 
 POSE_STDDEV: Final = float(np.radians(6.0))
-"""Radians per axis: standard deviation of a person's joint from the requested pose; gives 6-10 degrees of a segment."""
+"""Radians per axis: standard deviation of a joint from the requested pose; that of a segment becomes 6-10 degrees."""
 TISSUE_STDDEV: Final = float(np.radians(3.0))
 """Radians per axis: standard deviation of a sensor's rotation by soft tissue."""
 MOUNTING_STDDEV: Final = float(np.radians(10.0))
@@ -240,7 +240,7 @@ def _turned(stream: Stream) -> float:
 
 
 def pose_of(streams: Sequence[Stream], mountings: FloatArray, period: StillPeriod) -> Pose | None:
-    """The pose by the inclination of the arms; None if it is neither, or no arm carries a sensor.
+    """The pose by the inclination of the arms; None if neither pose is held, or no arm carries a sensor.
 
     Args:
         streams: k sensors.
@@ -303,7 +303,7 @@ def align_in_pose(
     if headings is not None and mountings is None:
         psi = prior.copy()
     elif headings is not None:
-        # with a common unknown part, the nearest headings to the known ones
+        # a common unknown part of the given headings is their mean difference from those by the mountings
         common = np.angle(np.exp(1j * (psi - prior)).mean())
         prior = prior + (common if known[0, 0] > (0.5 * np.pi) ** 2 else 0.0)
         psi = prior.copy()

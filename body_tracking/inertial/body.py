@@ -29,7 +29,7 @@ _TRUNK: Final = ("pelvis", "upper_trunk")
 
 
 class WornBody:
-    """Makes skeletons of segments' orientations.
+    """Makes skeletons from the orientations of segments.
 
     Args:
         model: of the body.
@@ -56,7 +56,7 @@ class WornBody:
     def skeleton(
         self, stamp_ns: int, segments: Sequence[str], rotations: FloatArray, covariances: FloatArray
     ) -> Skeleton:
-        """The body that fits orientations.
+        """The skeleton of the body model that best fits the orientations.
 
         Args:
             stamp_ns: nanoseconds.

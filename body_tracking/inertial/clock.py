@@ -5,8 +5,8 @@ of two sensors, or of a sensor and of a bone that a camera sees. A coarse search
 offset of a wide window; :class:`~body_tracking.calibration.clock_correlation.ClockFit` refines it over windows of
 motion.
 
-An offset is only returned where the data decide. Rates are smooth, so their samples are not independent; the variance
-of the correlation of two independent series is (Bartlett 1946)
+An offset is returned only where the data determine it. Rates are smooth, so their samples are not independent; the
+variance of the correlation of two independent series is (Bartlett 1946)
 
     var rho = 1 / n',  n' = T / sum_k rho_a(k) rho_b(k) dt                                                          (2)
 
@@ -76,14 +76,14 @@ def turning(stamps: FloatArray, rates: FloatArray) -> Series:
 
 
 def turning_of_sensor(stamps: FloatArray, rates: FloatArray, axis: FloatArray | None = None) -> Series:
-    """From angular rates (n, 3) rad/s; with an axis (3,) in the sensor's frame, without the part about it."""
+    """The series of angular rates (n, 3) rad/s; with an axis (3,) in the sensor's frame, without the part about it."""
     if axis is not None:
         rates = rates - (rates @ axis)[:, None] * axis / float(axis @ axis)
     return turning(stamps, np.linalg.norm(rates, axis=-1))
 
 
 def turning_of_bone(stamps: FloatArray, vectors: FloatArray) -> Series:
-    """From the vectors (n, 3) between two joints of a skeleton; NaN where unknown.
+    """The series of the vectors (n, 3) between two joints of a skeleton; NaN where unknown.
 
     ``|u x u'|`` of the direction u: a camera does not see a bone's rotation about its axis.
     """
@@ -133,7 +133,7 @@ def _autocorrelation(values: FloatArray, known: BoolArray) -> FloatArray:
 
 
 def _bartlett(a: FloatArray, known_a: BoolArray, b: FloatArray, known_b: BoolArray) -> float:
-    """Seconds of an independent sample of two series on the grid (eq. 2)."""
+    """Seconds per independent sample of two series on the grid (eq. 2)."""
     alike_a, alike_b = _autocorrelation(a, known_a), _autocorrelation(b, known_b)
     shared = min(len(alike_a), len(alike_b))
     return max(STEP * (1.0 + 2.0 * float((alike_a[1:shared] * alike_b[1:shared]).sum())), SAMPLE_TIME)
@@ -161,7 +161,7 @@ def _coarse(reference: Series, other: Series, guess: float, window: float) -> fl
     best = int(np.argmax(chance))
     if chance[best] < SIGNIFICANCE or best in (0, len(rho) - 1):
         return None
-    # scipy.signal has this, and takes a node 0.7 s to import
+    # scipy.signal finds peaks too, but takes a node 0.7 s to import
     peaks = 1 + np.flatnonzero((rho[1:-1] > rho[:-2]) & (rho[1:-1] > rho[2:]))
     rivals = peaks[np.abs(peaks - best) * STEP > 0.3]
     of_best, time_best = _unexplained(found, best)

@@ -1,16 +1,16 @@
 """Detection of exchanged and slipped sensors.
 
 **Exchanged.** A table has the log likelihoods of each of k streams on each of k segments; the assignment with the
-highest sum (Kuhn and Munkres) shows an exchange. The stated segments get a prior in favour, because forearm and upper
-arm of one side turn so similarly that each fits the other. With a skeleton, exchanged sensors turn as the other's bone:
-the difference of two sensors' turning rates has the correlation rho with the opposite difference of their bones', over
-n' independent samples. Limbs that move alike (a squat) have no difference, and are not told apart by it. The logarithm
-of the likelihood ratio is
+highest sum (Kuhn and Munkres) shows an exchange. The prior favours the stated segments, because forearm and upper arm
+of one side turn so similarly that each fits the other. With a skeleton, each of two exchanged sensors turns with the
+other's bone: the difference of the sensors' turning rates has the correlation rho with the opposite difference of their
+bones' rates, over n' independent samples. Limbs that move alike (a squat) give no difference, and cannot be
+distinguished this way. The logarithm of the likelihood ratio is
 
     - n' / 2 log(1 - rho^2),  with the sign of rho                                                                  (13)
 
-and needs neither alignment nor heading. In a pose, the orientation's distance from the intended mounting is normal with
-the variances of both. Of sensors with individual unknown headings, only the inclination counts.
+and needs neither alignment nor heading. In a pose, an orientation's deviation from the expected one is normal; its
+variance is the sum of those of pose and mounting. If each sensor has an unknown heading, only the inclination counts.
 
 **Slipped.** The residual between a segment's direction by a camera or a joint and by its sensor exceeds the noise for
 seconds. The median over a window rejects outliers; its standard deviation is that of the camera's persistent errors.
@@ -130,7 +130,8 @@ def likelihood_by_pose(
         expected = yaw(psi).T @ pose @ mountings.swapaxes(-1, -2)
         off = so3.rotation_vectors(measured[:, None].swapaxes(-1, -2) @ expected)
         tables.append(-0.5 * (off**2).sum(axis=-1) / variance - 1.5 * np.log(variance))
-    # the stated assignment where another fits as well at another heading, as of two forearms in a T-pose half a turn on
+    # the prior keeps the stated assignment where another fits as well at another heading: two forearms in a T-pose,
+    # exchanged, fit half a turn away
     best = max(tables, key=lambda table: _value(table + SURE * np.eye(len(segments))))
     return np.asarray(best)
 

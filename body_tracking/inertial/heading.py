@@ -41,7 +41,7 @@ from body_tracking.inertial.alignment import (
 from body_tracking.kinematics.ranges import RANGES
 
 HEADING_WALK: Final = float(np.radians(0.4))
-"""Radians per root second of a heading without magnetometer: 3 degrees in a minute, as of 0.05 deg/s of bias."""
+"""Radians per root second of a heading without magnetometer: 3 degrees in a minute, as with a bias of 0.05 deg/s."""
 ALIGNMENT_WALK: Final = float(np.radians(0.05))
 """Radians per root second and axis of an alignment: a degree and a half in a quarter of an hour."""
 CAMERA_TIME: Final = 1.0

@@ -36,7 +36,7 @@ class HeldPose:
     """A pose, and the readings during it.
 
     Attributes:
-        name: of the parameters' ``POSES``.
+        name: one of the parameters' ``POSES``.
         streams: of the sensors, while it was held.
         facing: the person's heading by the camera, radians from world's x; None without a camera.
     """
@@ -87,14 +87,14 @@ class PoseFinder:
         Args:
             streams: k sensors, of the last seconds.
             intended: (k, 3, 3) segment to sensor, intended mountings.
-            wanted: of the parameters: one of ``POSES``, or ``auto``.
+            wanted: one of the parameters' ``POSES``, or ``auto``.
             now: seconds.
             seen: skeletons of a camera over the same time with their stamps in seconds; empty without a camera.
             asked: the user requested the alignment.
 
         Returns:
-            None where the sensors or the camera show another pose or no heading, and where without arm sensor, camera
-            and request a pose cannot be distinguished from sitting still.
+            The pose; None where sensors or camera show another pose or no heading. Also None without a camera, a
+            request and a sensor on an upper arm: then a pose cannot be distinguished from sitting still.
         """
         periods = still_periods(streams)
         if not periods or periods[-1].end < now - _RECENT:

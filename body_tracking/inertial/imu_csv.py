@@ -1,9 +1,9 @@
 """Readings of inertial sensors as separated values, ``.csv`` or ``.csv.gz``: three layouts, recognised by the header.
 
 ``own``, a row per reading of a sensor, columns found by name: ``stamp`` (seconds, the sensor's clock); optional
-``received`` (seconds, the receiver's clock) and ``sensor`` (its name); and of ``orientation_x _y _z _w`` (sensor to
-earth, z up), ``angular_velocity_x _y _z`` (rad/s), ``linear_acceleration_x _y _z`` (m/s2, specific force) and
-``magnetic_field_x _y _z`` (tesla) any groups, each complete. An empty group means that this reading does not have the
+``received`` (seconds, the receiver's clock) and ``sensor`` (its name); and any of these groups, each complete:
+``orientation_x _y _z _w`` (sensor to earth, z up), ``angular_velocity_x _y _z`` (rad/s), ``linear_acceleration_x _y
+_z`` (m/s2, specific force) and ``magnetic_field_x _y _z`` (tesla). An empty group means that this reading lacks the
 quantity. The names are those of ``sensor_msgs``.
 
 ``LPMS``, the log of LP-Research's software for n sensors: columns ``IMU_TIMESTAMP(0)_0``, ``IMU_GYROSCOPE(0)_0``... in
@@ -44,7 +44,7 @@ _GROUPS: Final = {
     "acceleration": ("linear_acceleration", "xyz"),
     "magnetic_field": ("magnetic_field", "xyz"),
 }
-"""Quantity of a sample: the names of its columns up to the axis, and the axes."""
+"""For each quantity of a sample: the prefix of its columns' names, and the axes that follow."""
 _REPO_HEADER: Final = [
     *("Time", "Vicon Orientation", "", "", "", "IMU Acceleration", "", "", "IMU Gyroscope", "", ""),
     "IMU Magnetometer",

@@ -23,7 +23,7 @@ from body_tracking.core.imu import STANDARD_GRAVITY, ImuSample
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray
 
 OUTAGE_S: Final = 1.0
-"""A longer gap restarts the tilt, and the heading is as good as lost."""
+"""A longer gap restarts the tilt, and the heading is nearly unknown afterwards."""
 _STARTING: Final = 16
 """Number of readings for the initial rate, before the first orientation."""
 _RATE_OVER: Final = 256
@@ -142,7 +142,7 @@ class OrientationEstimator:
 
     @property
     def magnetically_disturbed(self) -> bool | None:
-        """Whether the field differs from the heading's reference, or there is none yet; None without a field."""
+        """Whether the field differs from the reference, or no reference exists yet; None without a field."""
         return bool(self._filter.getMagDistDetected()) if self._field_seen and self._filter is not None else None
 
     def update(self, sample: ImuSample) -> ImuOrientation | None:
@@ -199,7 +199,7 @@ class OrientationEstimator:
     def _start(self) -> ImuOrientation:
         """Run VQF over the first readings."""
         intervals = np.array(self._intervals)
-        # without gaps, which would bias the mean of so few
+        # without gaps, which would bias the mean of so few intervals
         self._step = float(intervals[intervals <= 3.0 * np.median(intervals)].mean())
         fields = sum(sample.magnetic_field is not None for sample in self._starting)
         spacing = self._step * len(self._starting) / fields if fields and self._magnetometer else self._step
@@ -416,7 +416,7 @@ _TURNING_S: Final = 5.0
 _COHERENT_S: Final = 0.3
 """Seconds for which a rate persists: over longer gaps, linear interpolation has no value."""
 _HIDDEN: Final = 0.2
-"""Standard deviation of the angle hidden by clipping, as a share of it: twice that on swings of 1.2 Hz."""
+"""Standard deviation of the angle hidden by clipping, as a share of this angle: twice that of swings at 1.2 Hz."""
 _JOINED_S: Final = 0.5
 """Seconds of clipping after which the angle is unknown."""
 _LEAST_HIDDEN: Final = 0.03

@@ -109,7 +109,7 @@ class MvnxRecording:
         partial: read a truncated file up to its last complete frame, with a warning, instead of raising an error.
 
     Raises:
-        MvnxError: while iterating, if anything about the file is not as the format says.
+        MvnxError: while iterating, if the file violates its format.
     """
 
     def __init__(self, path: Path | str, partial: bool = False) -> None:
@@ -164,7 +164,7 @@ class MvnxRecording:
         """All frames with all their quantities, including the poses.
 
         Raises:
-            MvnxError: the file is not as its format says.
+            MvnxError: the file violates its format.
         """
         self.warnings, self.header, self.progress = [], None, 0.0
         count = 0

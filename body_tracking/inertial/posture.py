@@ -26,7 +26,7 @@ _ENOUGH = 1e-8
 
 
 class OrientationKinematics:
-    """Orientations of segments to configurations of ``upper_body``."""
+    """Estimates configurations of ``UpperBody`` from orientations of segments."""
 
     def __init__(self, model: UpperBody, segments: Sequence[str]) -> None:
         """For the segments that carry sensors, at least one."""

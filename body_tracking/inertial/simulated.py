@@ -212,7 +212,7 @@ class SimulatedImu:
         times = times + _jitter(self.errors.jitter, period, len(times), rng)
         times = times[
             (times >= 2.0 * _STEP) & (times <= duration - 2.0 * _STEP)
-        ]  # the differences need the motion around
+        ]  # the differences need the motion before and after
         for begin, end in self.off:
             times = times[(times < begin) | (times >= end)]
         return times

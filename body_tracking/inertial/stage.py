@@ -122,7 +122,7 @@ class ImuStage(Stage):
             raise
         outputs = []
         if output.orientation is not None:
-            # of exchanged sensors the segment differs from the stated one
+            # the segment of an exchanged sensor differs from the stated one
             topic = graph.orientation_topic(output.orientation.segment)
             outputs.append(Output(topic, output.orientation, output.orientation.stamp_ns))
         if output.skeleton is not None:

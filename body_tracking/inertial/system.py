@@ -24,7 +24,7 @@ from body_tracking.pipeline.system import (
 def _specs(options: Options) -> Iterable[NodeSpec]:
     if options["imus"]:
         given = {"segments": options["imus"], **sensors_and_transport(options), **asked(options, subject="subject")}
-        # no skeleton will ever come, for which it would wait
+        # without cameras there is no skeleton to wait for
         alone: dict[str, Value] = {} if options["sensors"] else {"camera": False}
         yield NodeSpec("imu_skeleton", "imu_skeleton", defaults=alone, parameters=given)
 

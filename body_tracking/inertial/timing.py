@@ -1,4 +1,4 @@
-"""From the clocks of worn sensors to the output clock: the camera's, or that of receipt without a camera.
+"""Conversion of worn sensors' clocks to the output clock: the camera's, or without a camera that of receipt.
 
 Times of receipt give the offset of a clock up to the difference of the transports' delays; with a camera, motion gives
 this difference. The camera's own frames are used for its clock where they arrive. Its fused skeletons come later by the
@@ -15,13 +15,13 @@ from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.inertial.parameters import REFERENCE, SHARED
 
 _TRANSPORTS, _TRANSPORTS_WALK, _OFFSET_FLOOR = 0.03, 0.001, 0.003
-"""Standard deviations of the transports' difference (seconds), of its random walk (seconds per root second), and the
-least of an offset by motion (seconds)."""
+"""Standard deviations of the transports' difference (seconds), of its random walk (seconds per root second), and that
+added in quadrature to an offset by motion (seconds)."""
 
 
 @dataclass(slots=True)
 class _Transport:
-    """Seconds by which a sensor's stamps are later than the times of receipt say, and the variance of that."""
+    """Seconds by which a sensor's stamps are still late after correction by the times of receipt, and the variance."""
 
     offset: float = 0.0
     variance: float = _TRANSPORTS**2

@@ -1,8 +1,8 @@
 """Inertial sensors as a source: readings in, orientations of segments and a skeleton in ``world`` out.
 
-Puts together what the other modules of this package find: each sensor's orientation in an earth of its own (``worn``),
-its alignment and heading by a pose and by a camera's bones (``held_pose``, ``alignment``, ``heading``), its
-clock (``timing``, ``clock``), exchanged and slipped sensors (``detection``), and the body that fits all (``body``).
+Combines the other modules of this package: each sensor's orientation in an earth frame of its own (``worn``), its
+alignment and heading by a pose and by a camera's bones (``held_pose``, ``alignment``, ``heading``), its clock
+(``timing``, ``clock``), exchanged and slipped sensors (``detection``), and the body that fits all (``body``).
 
 Headings: with a camera, ``world`` is the camera's. Without one, x is where the person faced in the pose; the common
 part of all headings drifts, and the covariance grows with it.
@@ -56,7 +56,7 @@ _ASKED_S = 15.0
 _CAMERA_LASTS = 12.0
 """Factor on ``heading.CAMERA_TIME``: a camera's joint offsets persist longer than its other errors."""
 _CAMERA_SLIPS = 3.0
-"""The same factor for slips: part of the longer-lasting errors is the same before and after one."""
+"""Such a factor for slips: part of the longer-lasting errors is equal before and after a slip, and cancels."""
 _ALONE_S = 5.0
 """Seconds after which the tracker starts without a camera's skeleton."""
 _FRESH_NS = NANOSECONDS // 2
@@ -111,7 +111,7 @@ class InertialTracker:
         world: name of the output frame.
 
     Attributes:
-        counters: what happened since the construction, for diagnostics.
+        counters: event counts since the construction, for diagnostics.
         aligned: whether a pose has aligned the sensors.
 
     Raises:
@@ -308,7 +308,7 @@ class InertialTracker:
             self._first_ns = received_ns
 
     def _waits_for_camera(self, received_ns: int) -> bool:
-        """The camera's first skeleton defines the reference clock and ``world``."""
+        """Whether to wait for the camera's first skeleton, which defines the reference clock and ``world``."""
         if not self.parameters.camera or self._newest_ns is not None:
             return False
         assert self._first_ns is not None
@@ -321,7 +321,7 @@ class InertialTracker:
         return self._clocks.offset_ns(sensor.stated, sensor.clock)
 
     def _rebase(self) -> None:
-        """Start times again after a change of the output clock."""
+        """Restart all times after a change of the output clock."""
         self._tracker = self._new_tracker(self.alignment)
         self._epoch_ns, self._last = None, 0.0
         self._due.clear()
@@ -505,7 +505,7 @@ class InertialTracker:
             self._by_pose[sensor.stated] = dict(zip((each.segment for each in sensors), bounded, strict=True))
 
     def _exchange(self, sensors: Sequence[WornSensor], segments: Sequence[str]) -> bool:
-        """Assign sensors to the segments on which they were found; whether any of these is another one."""
+        """Assign sensors to the segments on which they were found; returns whether any segment changed."""
         pairs = zip(sensors, segments, strict=True)
         moved = [(sensor, segment) for sensor, segment in pairs if sensor.segment != segment]
         if not moved:

@@ -1,7 +1,7 @@
 """One worn inertial sensor: its orientation, its clock by receipt, and its problems.
 
 Without a magnetometer the heading variance that a driver or VQF states grows without bound. A filter of headings must
-not count it twice: the growth is handed over once, apart from the covariance.
+not count the growth twice, so it is passed on once, apart from the covariance.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ HISTORY_S: Final = 40.0
 NEAR_NS: Final = NANOSECONDS // 20
 """Time over which an orientation is extrapolated by its rate."""
 UNKNOWN_HEADING: Final = np.pi**2 / 3.0
-"""rad2: any heading."""
+"""rad2: variance of a heading that is uniform over a turn."""
 _OTHER_FRAME = 50
 """Readings of another frame in a row after which that frame is accepted."""
 _SPACING_NS = NANOSECONDS // 55
@@ -83,7 +83,7 @@ class WornSensor:
         latest: the last reading; None before the first one.
         growth: rad2 of heading variance since the caller last reset it to zero.
         has_field: whether readings have a magnetic field that is used.
-        counters: what happened.
+        counters: event counts.
         received_ns: receipt of the last reading; None before the first one.
     """
 
@@ -242,7 +242,7 @@ class WornSensor:
 
     def _estimated(self, sample: ImuSample) -> OrientedReading | None:
         if self._off_field() > _DISTURBED:
-            # before it knows the undisturbed field, VQF would take this one as such
+            # before VQF knows the undisturbed field, it would accept this one as the reference
             sample = replace(sample, magnetic_field=None)
         found = self._estimator.update(sample)
         if found is None:
