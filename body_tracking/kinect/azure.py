@@ -6,7 +6,7 @@ Microsoft's ROS driver (Azure_Kinect_ROS_Driver, both for ROS 1 and 2) publishes
 stamped with the capture time. It lacks the SDK's confidence: seen and guessed joints cannot be distinguished.
 
 SpineMid and SpineShoulder have no counterpart and are computed as midpoints; nose, eyes and ears are left out. Joints
-of one name lie at slightly different points of the body (Albert et al. 2020, Sensors 20:5104): no mapping corrects it.
+of one name lie at slightly different points of the body (Albert et al. 2020, Sensors 20:5104), which is not corrected.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _BODY_NUMBERS = 1 << 16
 
 
 class AzureError(BodyTrackingError):
-    """Raised for markers that are no bodies of the Azure Kinect."""
+    """Raised for markers that do not form bodies of the Azure Kinect."""
 
 
 class AzureJoint(IntEnum):

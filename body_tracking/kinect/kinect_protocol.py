@@ -18,11 +18,11 @@ offset type    header (64 bytes)
 56     int64   of a frame, when it was sent, by the sender's clock (ns); else 0
 ====== ======= ====================================================================================================
 
-A frame goes on with the sensor's own time (int64, ns), flags (uint8: 1 the floor is known, 2 the sensor is silent),
-the number of bodies (uint8), two zero bytes and the floor (4 float32: unit normal and distance, metres, in camera
-space). Then, of each body: the SDK's index (uint8, below 6), 7 zero bytes, its tracking id (uint64), and of its 25
-joints in the SDK's order: position (3 float32, metres, Kinect camera space), orientation (4 int16: quaternion x y z w
-times 32767, zeros where the SDK has none), tracking state (uint8) and a zero byte.
+The content of a frame is the sensor's own time (int64, ns), flags (uint8: 1 the floor is known, 2 the sensor is
+silent), the number of bodies (uint8), two zero bytes and the floor (4 float32: unit normal and distance, metres, in
+camera space). For each body follow the SDK's index (uint8, below 6), 7 zero bytes, its tracking id (uint64), and for
+each of its 25 joints in the SDK's order: position (3 float32, metres, Kinect camera space), orientation (4 int16:
+quaternion x y z w times 32767, zeros where the SDK has none), tracking state (uint8) and a zero byte.
 
 Clock messages are those of NTP (RFC 5905, section 8): a request holds t1, its answer t1, t2 and t3 (int64, ns), where
 t1 is by the clock of the receiver of frames, and t2 and t3, receipt of the request and sending of the answer, by that
@@ -123,7 +123,7 @@ class Frame(NamedTuple):
 
 
 class ClockTimes(NamedTuple):
-    """t1, t2 and t3 of a round trip, ns; of a request t2 and t3 are 0."""
+    """t1, t2 and t3 of a round trip, ns; in a request t2 and t3 are 0."""
 
     asked_ns: int
     received_ns: int

@@ -94,7 +94,7 @@ _BACKENDS = {
     "network": "body_tracking.kinect.network:NetworkSource",
     "recording": "body_tracking.recording.source:RecordingSource",
 }
-"""Of this package; a process imports only the one that it opens."""
+"""Backends of this package; a process imports only the one that it opens."""
 
 
 def backends() -> tuple[str, ...]:

@@ -40,12 +40,12 @@ SILENCE_NS = NANOSECONDS
 _REFUSAL_SHOWN_NS = 10 * NANOSECONDS
 _ANSWER_TIMEOUT_NS = 2 * NANOSECONDS
 _EARLIEST_NS, _LATEST_NS = NANOSECONDS, 5 * NANOSECONDS
-"""Frames are refused that were sent this long after their receipt, or this long before."""
+"""A frame is refused if it was sent, by its stamp, this long after its receipt or this long before it."""
 _FIRST_ASKS, _ASK_FAST_NS, _ASK_NS = 20, NANOSECONDS // 20, NANOSECONDS // 4
 """Number and period of the first clock requests of a session, and the period of the later ones."""
 
 _CHALLENGE_NS, _CHALLENGED = NANOSECONDS // 10, 64
-"""Shortest period of the challenges to an unknown session, and the number of sessions remembered for that."""
+"""Shortest period of the challenges to one unknown session, and the number of sessions whose challenges are stored."""
 
 _MAX_RATE, _MAX_JUMP = 600, 120
 """Greatest increase of sequence numbers, per second and at once; a Kinect sends 30 frames a second."""
@@ -162,7 +162,7 @@ class Receiver:
     # --- sessions and clocks
 
     def _challenge(self, session: int, source: Address, now_ns: int) -> None:
-        """Send a challenge to an unknown session; its random number is derived from it, so that none is stored."""
+        """Send a challenge to an unknown session; its random number is a keyed hash, so that none is stored."""
         self.counters["of unknown sessions"] += 1
         if now_ns - self._unknown_ns > SILENCE_NS:
             self._challenged_ns = now_ns

@@ -3,7 +3,7 @@
 The file is text, a value or a row of values per line: the number of frames; per frame the number of bodies; per body
 ten values (tracking id, clipped edges, confidence and state of the left and the right hand, restricted, lean x and y,
 tracking state), the number of joints, and per joint twelve: x, y, z (metres, camera space), depth x and y, colour x
-and y (pixels), orientation w, x, y, z, tracking state. There are no times in it; the sensors ran at 30 Hz. The name
+and y (pixels), orientation w, x, y, z, tracking state. The file has no times; the sensors ran at 30 Hz. The name
 ``SsssCcccPpppRrrrAaaa`` gives setup, camera, performer, repetition and action.
 
 Source: Shahroudy, Liu, Ng, Wang, "NTU RGB+D: A Large Scale Dataset for 3D Human Activity Analysis", CVPR 2016, and the
@@ -45,7 +45,7 @@ class _CutOff(Exception):
 
 
 def sensor_of(path: Path) -> str | None:
-    """``kinect<camera>`` from a file name of the data set; None if the name is another."""
+    """``kinect<camera>`` from a file name of the data set; None for any other name."""
     match = _NAME.search(path.name)
     return f"kinect{int(match[1])}" if match else None
 

@@ -52,8 +52,8 @@ def obstruction(sight: FloatArray, capsules: Capsules) -> Obstruction:
     The line of sight ends at the skin over the joint that faces the sensor: in front of its centre by the radius of the
     widest capsule that ends in it. If it passes the axis of another capsule at a distance d, the cover is
     1 - d / radius, times the square of the ratio of the radii where that capsule is thinner than the joint's own. A
-    capsule covers neither the joints at its ends nor a joint within half its radius of its axis, from where to its
-    surface the cover grows to the whole; the trunk does not cover its spine.
+    capsule covers neither the joints at its ends nor a joint within half its radius of its axis; from there to its
+    surface, the cover of a joint grows to the full value. The trunk does not cover its spine.
 
     Args:
         sight: (n, 25, 3) metres, the joints in the sensor's optical frame.

@@ -41,7 +41,7 @@ _SET_NS = NANOSECONDS // 4
 
 
 class RoundTrips:
-    """The local clock minus a remote one, by messages there and back.
+    """The local clock minus a remote one, from round trips of messages.
 
     A round trip with t1 and t4 by the local clock, t2 and t3 by the remote one, bounds the offset,
 
@@ -76,11 +76,11 @@ class RoundTrips:
 
     @property
     def round_trip_ns(self) -> int:
-        """The shortest one of the window."""
+        """The shortest round trip of the window."""
         return min((trip for _, _, trip in self._bins), default=0)
 
     def offset_ns(self, remote_ns: int) -> int:
-        """The local clock minus the remote one when that shows this time."""
+        """The local clock minus the remote one, at a time of the remote clock."""
         return self._clock.offset_ns_at(remote_ns)
 
     def add(self, t1: int, t2: int, t3: int, t4: int) -> bool:

@@ -8,14 +8,14 @@ from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.kinect.remote_clock import CaptureClock
 
 OTHER_CLOCK_NS: Final = 60 * NANOSECONDS
-"""Stamps this far from the time of receipt are of another clock: delays and errors of synchronisation are smaller."""
+"""Stamps farther from the time of receipt are of another clock: delays and errors of synchronisation are smaller."""
 
 
 class RosTime:
     """ROS time of the messages of one driver, in order of receipt.
 
-    Drivers should stamp in ROS time (REP-145 requires it of inertial sensors). The clock of a driver that does not is
-    related to the times of receipt by the least delay so far, see :class:`CaptureClock`.
+    Drivers should stamp in ROS time (REP-145 requires it of inertial sensors). Any other clock is related to the times
+    of receipt by the least delay so far, see :class:`CaptureClock`.
     """
 
     def __init__(self) -> None:
@@ -26,7 +26,7 @@ class RosTime:
 
         Args:
             stamp_ns: its header stamp.
-            received_ns: ROS time of its receipt; 0 before simulated time has begun: the stamp is returned unchanged.
+            received_ns: ROS time of its receipt; 0 before simulated time has begun, which leaves the stamp unchanged.
         """
         if not received_ns or abs(received_ns - stamp_ns) <= OTHER_CLOCK_NS:
             return stamp_ns

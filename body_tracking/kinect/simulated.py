@@ -21,7 +21,7 @@ from body_tracking.core.parameters import (
 )
 
 SECTION: Final = "simulated_kinect"
-"""Of a parameters file."""
+"""Section of a parameters file with these parameters."""
 
 
 class SimulatedKinectError(BodyTrackingError):

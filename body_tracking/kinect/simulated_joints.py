@@ -33,8 +33,8 @@ _KINDS: Final[dict[str, tuple[Any, ...]]] = {
 disagreement of two sensors there, and the greater errors of hands and feet in Schlagenhauf 2017, table E.1; along the
 ray: the consistent disagreement of sensors 45 and 90 degrees apart there; anatomical offsets: of the spine forward and
 up by Schlagenhauf 2017, table E.1, of the shoulders against SpineShoulder by the five subjects of ``kinect_vs_vicon``,
-alike on both sides (medians: 27 mm forward, 8 mm inward, of a hanging arm's 0 mm up). An arm errs by its direction
-besides (``calibration.arm_directions``)."""
+alike on both sides (medians: 27 mm forward, 8 mm inward, of a hanging arm's 0 mm up). The directions of the arms have
+errors of their own (``calibration.arm_directions``)."""
 
 
 def _column(number: int) -> FloatArray:
@@ -74,7 +74,7 @@ ON_TRUNK: Final = ~(ARMS | LEGS)
 FIRST: Final[IntArray] = np.where(ON_TRUNK, np.intp(Joint.ELBOW_LEFT), np.arange(N_JOINTS))
 SECOND: Final[IntArray] = np.where(ON_TRUNK, np.intp(Joint.ELBOW_RIGHT), PARENTS)
 SECOND[named("ELBOW", "KNEE")] = np.flatnonzero(named("WRIST", "ANKLE"))
-"""(25,) segments, named by their outer joints, on whose directions a joint's errors depend; the trunk's on the arms."""
+"""(25,) outer joints of the segments on whose directions a joint's errors depend; the upper arms for the trunk."""
 REST: Final[FloatArray] = np.zeros((N_JOINTS, 3))
 REST[LEGS] = [0.0, 0.0, -1.0]
 REST[ARMS, 1] = [1.0 if joint.name.endswith("LEFT") else -1.0 for joint in Joint if ARMS[joint]]

@@ -71,7 +71,7 @@ _SPINE_WEIGHT, _FAR_DEPTH = 0.4, 0.3
 _MIDDLE = 0.75
 """Cover from which a joint is behind the middle of a body part."""
 _LOST_FROM, _FIND_AGAIN = 0.6, 0.15
-"""Share of the trunk's joints behind other people from which a body is lost, and the seconds until it is found."""
+"""Share of the trunk's joints behind other people from which a body is lost, and seconds until it is found again."""
 _REST_LEVEL = -0.27
 """Height of a shoulder over SpineShoulder when standing, as a share of its distance (``kinect_pairs``)."""
 _SPINE_MID_SHARE, _SPINE_MID_BACK = 0.578, 0.007
@@ -367,7 +367,7 @@ class _Sighting:
         return moved
 
     def _offset(self, sight: FloatArray, view: _View, segments: FloatArray, misreading: Misreading) -> FloatArray:
-        """(n, 25, 3) what all people share, a person's own offsets in the body's frames, and offsets along the ray."""
+        """(n, 25, 3) offsets common to all people, a person's own in the body's frames, and those along the ray."""
         common = turn_arms(sight, view.thorax, KINECT_V2.measured) - sight
         common += np.einsum("nik,jk->nji", view.trunk, tables.ANATOMICAL)
         own = np.einsum("nik,jk->nji", view.trunk, self.errors.offset * tables.SLOW_SCALE[:, None] * misreading.offset)
@@ -455,7 +455,7 @@ class _Sighting:
         return states
 
     def _unseen(self, veiled: FloatArray) -> BoolArray:
-        """(n,) whether the body is lost: most of the trunk is, or was a moment ago, behind other people."""
+        """(n,) whether the body is lost: most of the trunk is behind other people, or was within ``_FIND_AGAIN``."""
         hidden = (veiled[:, tables.ON_TRUNK] > self.errors.hidden_from).mean(axis=1) > _LOST_FROM
         until = np.convolve(hidden, np.ones(1 + round(_FIND_AGAIN / self.period)))[: len(hidden)]
         return until > 0.5

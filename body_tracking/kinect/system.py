@@ -61,7 +61,7 @@ def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
 
 
 _AZURE = "/body_tracking_data"
-"""Ends the topic of Microsoft's driver of the Azure Kinect."""
+"""Suffix of the topic of Microsoft's driver of the Azure Kinect."""
 
 
 def _finds(topics: Mapping[str, str]) -> dict[str, Value]:

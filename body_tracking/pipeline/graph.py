@@ -28,7 +28,7 @@ PARENT_VARIABLE = "BODY_TRACKING_SUPERVISOR"
 END = "graph/end"
 """The service of ``up`` that ends the graph."""
 UP_NODE = "body_tracking_up"
-"""Begins the name of the node of ``body_tracking up``."""
+"""Prefix of the node's name of ``body_tracking up``."""
 
 SKELETON = SENSOR_DATA
 RELIABLE_SKELETON = Qos(reliability="reliable", depth=1000)
