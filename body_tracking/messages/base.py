@@ -22,7 +22,7 @@ class MessageTypes(Protocol):
     """A family of message classes."""
 
     def make(self, type_name: str, /, **fields: Any) -> Any:
-        """A message of type ``pkg/msg/Name`` with every one of its fields given."""
+        """A message of type ``pkg/msg/Name``; all its fields must be given."""
 
     def octets(self, data: bytes) -> Any:
         """The value of a ``uint8[]`` field."""

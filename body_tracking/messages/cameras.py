@@ -13,7 +13,7 @@ CAMERA_INFO: Final = "sensor_msgs/msg/CameraInfo"
 
 
 def camera_to_info(camera: Camera, stamp_ns: int, types: MessageTypes) -> Any:
-    """The message of a full, unrectified image."""
+    """``sensor_msgs/CameraInfo`` of a full, unrectified image."""
     projection = np.hstack([camera.matrix, np.zeros((3, 1))])
     region = types.make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
     return types.make(
@@ -33,7 +33,7 @@ def camera_to_info(camera: Camera, stamp_ns: int, types: MessageTypes) -> Any:
 
 
 def info_to_camera(message: Any) -> Camera:
-    """The camera; missing coefficients of ``plumb_bob`` are zero.
+    """The camera in a ``sensor_msgs/CameraInfo``; missing coefficients of ``plumb_bob`` are zero.
 
     Raises:
         MessageError: not calibrated (zero focal lengths), another distortion model, a binned or cropped image.

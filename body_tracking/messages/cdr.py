@@ -1,4 +1,4 @@
-"""Skeletons, of which the graph passes on most, written and read as CDR bytes without message objects.
+"""Skeletons, the most frequent messages, written and read as CDR bytes without message objects.
 
 CPU microseconds per message, including the conversion to and from our own types (rosbags 0.11.9, rclpy 7.1.6):
 
@@ -165,7 +165,7 @@ def _header(stamp_ns: int, frame_id: str) -> bytes:
 
 _KINDS = ((True, False), (True, True), (False, False))
 _KNOWN = tuple(_layout(count, *kind) for count in range(1, 7) for kind in _KINDS)
-"""The layouts that are read here: of 1 to 6 bodies."""
+"""The layouts that are read here: 1 to 6 bodies of each kind."""
 
 
 def _read_header(cdr: bytes) -> tuple[int, str, int] | None:

@@ -30,7 +30,7 @@ def record_of(fields: Fields) -> np.dtype[Any]:
 
 
 def make_cloud(points: Any, fields: Fields, stamp_ns: int, frame_id: str, types: MessageTypes) -> Any:
-    """The message of an array of :func:`record_of` these fields; as one row, whatever the array's shape."""
+    """The message of an array of records of these fields, in one row (height 1) for any shape of the array."""
     offsets = points.dtype.fields
     finite = [bool(np.isfinite(points[name]).all()) for name, kind in fields[:3] if kind == FLOAT32]
     return types.make(
@@ -56,8 +56,8 @@ def read_cloud(cloud: Any, wanted: Mapping[str, int], needed: Sequence[str], mos
     Args:
         cloud: the message; fields that are not wanted are ignored.
         wanted: datatypes by name.
-        needed: the fields without which it is malformed.
-        most: points.
+        needed: fields without which the message is malformed.
+        most: largest number of points.
 
     Raises:
         MessageError: fields missing or of another type, big-endian data, sizes that contradict each other, too many

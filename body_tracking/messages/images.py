@@ -1,4 +1,4 @@
-"""``sensor_msgs/Image`` of one brightness or distance per pixel."""
+"""``sensor_msgs/Image`` to and from arrays: brightness, distance or colour."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from body_tracking.messages.base import MessageError, MessageTypes, to_header, t
 
 BRIGHTNESS: Final = {"mono8": "u1", "8UC1": "u1", "mono16": "u2", "16UC1": "u2"}
 DEPTH: Final = {"16UC1": "u2", "32FC1": "f4", "mono16": "u2"}
-"""Encodings of distances: millimetres, metres (REP-118), and as some drivers call millimetres."""
+"""Encodings of distances: millimetres, metres (REP-118), and ``mono16``, by which some drivers mean millimetres."""
 MAX_PIXELS: Final = 1 << 26
-"""An image with more is malformed."""
+"""An image with more pixels is malformed."""
 
 
 _COLOURS: Final = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4}
@@ -26,7 +26,8 @@ _GREY: Final = ("mono8", "8UC1")
 def to_mono(message: Any) -> tuple[int, NDArray[Any], bool]:
     """Stamp in nanoseconds, (height, width) brightness, and whether the image was in colour.
 
-    Of a colour image the mean of the channels: an infrared camera that states one has three equal ones.
+    The brightness of a colour image is the mean of its channels: an infrared camera with such an encoding has three
+    equal ones.
 
     Raises:
         MessageError: another encoding, sizes that contradict each other.
@@ -41,7 +42,7 @@ def to_mono(message: Any) -> tuple[int, NDArray[Any], bool]:
 
 
 def to_rgb(message: Any) -> tuple[int, str, NDArray[np.uint8]]:
-    """Stamp in nanoseconds, frame, and (height, width, 3) red, green, blue of an image in colour, or grey in three.
+    """Stamp in nanoseconds, frame, and (height, width, 3) red, green and blue of a colour image or of a grey one.
 
     Raises:
         MessageError: another encoding, sizes that contradict each other.
@@ -77,7 +78,7 @@ def image_to_array(message: Any, encodings: Mapping[str, str] = BRIGHTNESS) -> t
 
     Args:
         message: of ``sensor_msgs/Image``.
-        encodings: those that are allowed, with the kind of number of each.
+        encodings: the allowed ones, with numpy's type of each.
 
     Raises:
         MessageError: another encoding, as of a colour image; sizes that contradict each other.
@@ -93,7 +94,7 @@ def image_to_array(message: Any, encodings: Mapping[str, str] = BRIGHTNESS) -> t
 def array_to_image(pixels: NDArray[Any], stamp_ns: int, frame_id: str, types: MessageTypes, encoding: str = "") -> Any:
     """The message of (height, width) or (height, width, channels) pixels.
 
-    Without an encoding ``mono8`` or ``mono16``.
+    The default encoding is ``mono8`` or ``mono16``, by the size of a number.
     """
     height, width = pixels.shape[:2]
     rows = np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder("<"))

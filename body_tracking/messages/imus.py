@@ -14,7 +14,7 @@ from body_tracking.core.skeleton import FloatArray
 from body_tracking.messages.base import MessageError, MessageTypes, to_header, to_nanoseconds, to_vector
 
 _ABSENT = np.diag([-1.0, 0.0, 0.0])
-"""The covariance of a quantity that is not there (REP-145)."""
+"""The covariance that marks an absent quantity (REP-145)."""
 
 
 def imu_to_message(

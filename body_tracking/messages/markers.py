@@ -40,7 +40,7 @@ def marker(
         types: the family of message classes to build.
         points: ``geometry_msgs/Point``.
         colours: ``std_msgs/ColorRGBA`` of each point.
-        text: of a marker of text.
+        text: content of a text marker.
     """
     return types.make(
         MARKER,

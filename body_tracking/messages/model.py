@@ -25,7 +25,7 @@ def estimate_to_joint_state(estimate: ModelEstimate, model: BodyModel, types: Me
 
 
 def estimate_to_stddevs(estimate: ModelEstimate, model: BodyModel, types: MessageTypes) -> Any:
-    """As :func:`estimate_to_joint_state`, the standard deviations of small tangent vectors at the estimate."""
+    """As :func:`estimate_to_joint_state`, but the standard deviations of the tangent vector at the estimate."""
     deviations = np.sqrt(np.maximum(estimate.covariance.diagonal(), 0.0))
     return _joint_state(estimate, model, deviations[: model.nv], deviations[model.nv :], types)
 
@@ -86,7 +86,7 @@ def coordinates_to_configuration(
 
 
 COVARIANCE_ENCODING = "32FC1"
-"""Of the image that holds covariances: one float32 per pixel."""
+"""Encoding of the image that holds covariances: one float32 per pixel."""
 
 
 def covariance_to_image(estimate: ModelEstimate, types: MessageTypes) -> Any:

@@ -11,7 +11,7 @@ class NodeStatus:
     """One status of ``/diagnostics``.
 
     Attributes:
-        name: ``<node>: <subject>``, with the node's namespace where the receiver has selected none.
+        name: ``<node>: <subject>``, with the node's namespace unless the receiver selected one.
         level: 0 OK, 1 warning, 2 error, 3 stale.
         text: one line.
         values: rates, counters.

@@ -1,4 +1,4 @@
-"""``geometry_msgs/PoseArray`` of points: the orientations say nothing."""
+"""``geometry_msgs/PoseArray`` of points; the orientations have no meaning."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def pose_array_to_points(message: Any) -> tuple[int, FloatArray]:
     """Stamp in nanoseconds, and points (n, 3), metres.
 
     Raises:
-        MessageError: a number is not finite, or the stamp is none.
+        MessageError: a number is not finite, or the stamp is invalid.
     """
     places = [pose.position for pose in message.poses]
     points = np.array([[place.x, place.y, place.z] for place in places], dtype=np.float64).reshape(-1, 3)

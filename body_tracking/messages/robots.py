@@ -20,8 +20,8 @@ def command_to_trajectory(
     Without velocities, because that controller refuses a trajectory that ends in motion (its parameter
     ``allow_nonzero_velocity_at_trajectory_end``, false from Jazzy on).
 
-    The n joints are at ``position`` (n,), radians, ``from_start`` seconds after ``stamp_ns``, or after the message
-    arrives where that is 0.
+    The n joints shall reach ``position`` (n,), radians, ``from_start`` seconds after ``stamp_ns``, or after the arrival
+    of the message if ``stamp_ns`` is 0.
     """
     sec, nanosec = divmod(round(from_start * NANOSECONDS), NANOSECONDS)
     none = types.floats(np.empty(0))

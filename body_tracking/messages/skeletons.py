@@ -33,7 +33,7 @@ MAX_BODIES = 64
 def skeletons_to_cloud(skeletons: Sequence[Skeleton], types: MessageTypes) -> Any:
     """Bodies seen at one instant as one ``sensor_msgs/PointCloud2``: a point per joint and body, in SDK order.
 
-    There is at least one body; all have the same stamp, frame and kind (covariances and velocities or not).
+    At least one body; all with the same stamp, frame and kind (with or without covariances and velocities).
     """
     first = skeletons[0]
     fields: Fields = _FIELDS
