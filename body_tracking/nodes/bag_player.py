@@ -57,7 +57,7 @@ PARAMETERS = (
 )
 
 _LOOK_NS = 20_000_000  # between two counts of subscribers
-_SETTLE_NS = 250_000_000  # from finding the subscribers until they have found this node too
+_SETTLE_NS = 250_000_000  # for the subscribers, once found, to discover this node too
 
 
 class BagPlayer(GraphNode):
@@ -149,7 +149,7 @@ class BagPlayer(GraphNode):
         return publishers
 
     def wanted_subscribers(self, texts: tuple[str, ...]) -> dict[str, int]:
-        """How many subscribers each of these topics must have: ``/topic`` or ``/topic:2``."""
+        """The required number of subscribers of each topic in ``/topic`` or ``/topic:2``."""
         wanted = {}
         for text in texts:
             topic, colon, number = text.partition(":")
@@ -225,7 +225,7 @@ class BagPlayer(GraphNode):
     # --- diagnostics
 
     def warn_of_damage(self) -> None:
-        """Log damage in the bag, which is found during reading."""
+        """Log damage that was found in the bag since the last call."""
         for warning in self.reader.warnings[self.warned :]:
             self.get_logger().warning(warning)
         self.warned = len(self.reader.warnings)

@@ -99,7 +99,7 @@ class BagRecorder(GraphNode):
         self.inputs: dict[str, tuple[Qos, Any]] = {}
         self.refused: dict[str, str] = {}
         self.early: list[tuple[float, str, bytes]] = []
-        """Messages from before the first ``/clock``: until when each is kept (steady seconds), topic and CDR bytes."""
+        """Messages from before the first ``/clock``: (steady seconds until which it is kept, topic, CDR bytes)."""
         self.before_the_clock = 0
         self.error = ""
         self.written = self.lost = self.n_bytes = 0
@@ -149,7 +149,7 @@ class BagRecorder(GraphNode):
         return f"{self.written} messages in {self.folder}"
 
     def answer(self, action: Callable[[], str], _: Any, response: Any) -> Any:
-        """``recorder/start`` and ``recorder/stop``."""
+        """Callback of ``recorder/start`` and ``recorder/stop``."""
         try:
             response.message = action()
             response.success = True
@@ -191,7 +191,7 @@ class BagRecorder(GraphNode):
         return topic not in self.exclude and names.within(topic, self.get_namespace()) is not None
 
     def adapt(self, topic: str, type_name: str) -> None:
-        """Subscribe with the strongest QoS that all publishers match; again when they have changed."""
+        """Subscribe with the strongest QoS that all publishers match; subscribe again when that QoS has changed."""
         publishers = self.get_publishers_info_by_topic(topic)
         if not publishers or self.writer is None or self.refused.get(topic) == type_name:
             return
@@ -245,7 +245,7 @@ class BagRecorder(GraphNode):
         self.forget_early()
 
     def forget_early(self) -> None:
-        """Drop waiting messages that are too old; of too many the oldest, latched ones last."""
+        """Drop waiting messages that are too old, and the oldest beyond the memory limit; latched ones last."""
         now, size = time.monotonic(), 0
         kept: list[tuple[float, str, bytes]] = []
         self.early.sort(key=lambda each: each[0])

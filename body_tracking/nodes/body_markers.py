@@ -54,7 +54,7 @@ PARAMETERS = (
 )
 
 _FRUSTUM_DEPTH: Final = 0.3
-"""Metres to which a sensor's view is drawn."""
+"""Metres: depth of the drawn frustum of a sensor."""
 
 
 class BodyMarkers(GraphNode):

@@ -1,9 +1,9 @@
 """A person's joint angles to the commands of a robot's controller, with a safe stop.
 
-A node of its own, so that it does not end with the nodes that it monitors. However the rest of the graph ends, it holds
-the robot ``silence`` seconds after the last input, by the wall clock, also while ``/clock`` stands still. If this node
-ends, the commands end, and the robot's controller decides what follows. It publishes no command while another node
-publishes them. Not a safety-rated function: docs/robots.md.
+This is a node of its own, so that it does not end with the nodes that it monitors. If the inputs cease for any reason,
+it holds the robot ``silence`` seconds after the last one, by the wall clock, also while ``/clock`` stands still. If
+this node ends, the commands end, and the robot's controller decides what follows. The node publishes no command while
+another node publishes commands. It is not a safety-rated function: docs/robots.md.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ PARAMETERS = (
 )
 
 _UNPAIRED = 16
-"""Angles and standard deviations that may wait for each other."""
+"""Stamps whose angles or standard deviations may wait for their counterpart."""
 _LOOK_AROUND_NS = 4_000_000_000
 """Time after which a node has found all other publishers: DDS announces them at least every 3 s."""
 _LEVELS = {State.FOLLOWING: 0, State.APPROACHING: 0, State.HOLDING: 1, State.STOPPED: 2}
@@ -154,7 +154,7 @@ class RobotCommands(GraphNode):
         return response
 
     def others(self) -> str:
-        """The other publishers of this robot's commands, or that the search is not finished; empty for none."""
+        """A line that names other publishers of the robot's commands or says that the search goes on; else empty."""
         topic = self.output.topic_name
         if time.monotonic_ns() - self.started_ns < _LOOK_AROUND_NS:
             return f"looking for other publishers of {topic}"

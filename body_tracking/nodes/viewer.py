@@ -73,7 +73,7 @@ PARAMETERS = (
 _STALE_S = 1.0
 """Age from which skeletons are drawn pale, and messages of views are not drawn, seconds."""
 _TOGETHER_S = 0.4
-"""Time for which a person is shown after the last message with that person, seconds."""
+"""Time for which a person is drawn after the last message with that person, seconds."""
 _ANSWER_S = 30.0
 """Timeout of service calls, seconds."""
 _WAITING = 64
@@ -84,13 +84,13 @@ _FAILURES = 10
 """Consecutive failed drawings after which the node ends."""
 _NICE = 10
 _RECENT = 16
-"""Messages of a view's topic that are kept, to find those of one time."""
+"""Messages per topic of a view that are kept, to match the topics by stamp."""
 _CONNECT_S = 1.0
-"""Seconds between two checks whether a view needs its topics."""
+"""Period of the check which topics the views need, seconds."""
 
 
 IMPORTED_AT_START: Final = ("body_tracking.viewing.page",)
-"""Takes a second, in which a signal ends the process at once."""
+"""The import takes a second, during which a signal ends the process at once."""
 
 
 class ViewerNode(GraphNode):
@@ -122,7 +122,7 @@ class ViewerNode(GraphNode):
         self.viewed: dict[str, tuple[Qos, Any]] = {}
         """Subscriptions of the views' topics, and their profiles."""
         self.held: set[str] = set()
-        """Topics of the views whose last message holds however old it is."""
+        """Topics of the views whose last message stays valid at any age."""
         self.page = self.open_page(given)
         for topic in (*map(graph.skeleton_topic, self.sensors), graph.FUSED, graph.FILTERED):
             self.subscribe(topic, PointCloud2, to_profile(LATEST), partial(self.on_latest, topic), raw=True)
@@ -194,7 +194,7 @@ class ViewerNode(GraphNode):
             self.viewed[topic] = profiles[topic], subscription
 
     def view_profile(self, topic: str) -> Qos:
-        """The profile of a view's subscription: what the publishers offer where the last message is needed."""
+        """The profile of a view's subscription; for held topics the strongest one that the publishers offer."""
         publishers = self.get_publishers_info_by_topic(self.full_name(topic)) if topic in self.held else ()
         return request_for([from_profile(each.qos_profile) for each in publishers], 1) if publishers else LATEST
 
@@ -259,9 +259,9 @@ class ViewerNode(GraphNode):
             self.page.draw_bodies(self.bodies(), self.body)
 
     def fresh(self) -> dict[str, list[bytes]]:
-        """The messages of the views' topics that are not old.
+        """The messages of the views' topics that are not old, by the clock of timeouts.
 
-        By the clock of timeouts: a mesh comes five times per second of a recording, every second of a slow playback.
+        That clock follows the playback: a mesh at 5 Hz in the recording comes once a second in a slow playback.
         """
         now_ns, most_ns = self.waiting_ns(), _STALE_S * NANOSECONDS
         kept = dict(self.recent)  # the other thread changes it
@@ -284,7 +284,7 @@ class ViewerNode(GraphNode):
         )
 
     def seen(self, topic: str) -> Seen:
-        """The latest skeletons of a topic, of all people, who may be in separate messages; decodes a message once."""
+        """The latest skeletons of a topic; people may come in separate messages, and each message is decoded once."""
         cdr, received = self.latest.get(topic, (b"", -np.inf))
         people = self.people.setdefault(topic, {})
         if cdr and cdr is not self.read.get(topic):
@@ -365,7 +365,7 @@ class ViewerNode(GraphNode):
     def seek(self, place_s: float) -> str:
         """Continue the bag at a place."""
         self.seeks += 1
-        # a parameter that does not change is not applied, and the bag has gone on meanwhile
+        # an unchanged parameter is not applied, although the bag has gone on meanwhile: alternate by a microsecond
         self.set_parameters_of("bag_player", position=place_s + 1e-6 * (self.seeks % 2))
         return f"plays on from {place_s:.1f} s"
 
@@ -423,7 +423,7 @@ class ViewerNode(GraphNode):
             raise PageError(f"{client.service_name}: no node that offers it runs")
         future = client.call_async(request)
         end = time.monotonic() + _ANSWER_S
-        # a callback of the future would be a task, which our executor runs only when it is idle
+        # poll: a callback of the future would be a task, which our executor runs only when it is idle
         while not future.done():
             if time.monotonic() > end or self.ended.wait(0.02):
                 client.remove_pending_request(future)
