@@ -7,9 +7,9 @@ simulated   people with seeds on which nothing was tuned: all motions in turn, l
 pairs       the nine real pairs of Kinect v2 sensors (``kinect_pairs``)
 clips       real exercises of the right arm in front of one Kinect v2 (``kinect_vs_vicon``)
 
-``unusual`` is the share of the known shoulders (all three standard deviations below 15 degrees, conventions of the
-model) in an unusual branch: the angles are outside their usual ranges by a sum of more than 30 degrees, and the
-equivalent triple of the same rotation is inside. Both a step and an unusual branch mislead a user of the angles.
+``unusual`` is the percentage of the shoulders with a known direction (first two angles below 15 degrees, conventions of
+the model) in an unusual branch: the angles are outside their usual ranges by 30 degrees more than the equivalent triple
+of the same rotation. Both a step and an unusual branch mislead a user of the angles.
 
 Recordings and pairs are replayed as by ``body_tracking replay``, with each filter in turn; clips are filtered frame by
 frame. ``known`` is the share of the frames with angles in which elevation, plane of elevation, elbow and trunk angles
@@ -100,17 +100,19 @@ def unusual(angles: AngleSeries) -> tuple[int, int]:
         # at 90 degrees for Cardan angles
         mirrored = (0.0 if abs(first @ last) > 0.5 else np.pi) - triples[:, 1]
         others = np.stack([triples[:, 0] + np.pi, mirrored, triples[:, 2] + np.pi], axis=1)
-        own, other = (_outside(each, low, high) for each in (triples, others))
-        sure = (angles.stddev[:, columns] < SURE).all(axis=1)
-        found += np.array([sure.sum(), (sure & (own > _UNUSUAL) & (other == 0.0)).sum()])
+        together = np.radians(chain.angles.together)
+        own, other = (_outside(each, low, high, together) for each in (triples, others))
+        sure = (angles.stddev[:, columns[:2]] < SURE).all(axis=1)
+        found += np.array([sure.sum(), (sure & (own - other > _UNUSUAL)).sum()])
     return int(found[0]), int(found[1])
 
 
-def _outside(triples: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """(n,) sum of the amounts by which (n, 3) angles, modulo full turns, leave their ranges, radians."""
+def _outside(triples: FloatArray, low: FloatArray, high: FloatArray, together: float) -> FloatArray:
+    """(n,) sum of the amounts by which (n, 3) angles, modulo full turns, leave their usual ranges, radians."""
     middle = 0.5 * (low + high)
     inside = middle + wrapped(triples - middle)
     outside: FloatArray = np.maximum(np.maximum(inside - high, low - inside), 0.0).sum(axis=1)
+    outside += np.maximum(np.abs(inside[:, :2]).sum(axis=1) - together, 0.0)
     return outside
 
 

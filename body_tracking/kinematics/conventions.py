@@ -254,6 +254,9 @@ _SIDES: Final = ("left", "right")
 _TRUNK_USUAL = ((-60.0, 110.0), (-60.0, 60.0), (-55.0, 55.0))
 SHOULDER_USUAL = ((-60.0, 180.0), (-60.0, 180.0), (-100.0, 100.0))
 """Degrees: (least, greatest) flexion, abduction and inward rotation; AAOS, as in ``kinematics.ranges``, outwards."""
+_SHOULDER_TOGETHER: Final = 200.0
+"""Degrees: usual sum of flexion and abduction. Hanging arms are at (0, 0), or at (180, 180) with half a turn more of
+rotation, which the range of that poorly observed angle would prefer where noise rotates a straight arm beyond it."""
 _ELBOW_USUAL = (RANGES["elbow_flexion"], (-90.0, 90.0), RANGES["forearm_pronation"])
 
 
@@ -279,7 +282,7 @@ def _model(model: UpperBody) -> Convention:
             f"clavicle_{side}",
             f"upper_arm_{side}",
             # its singular pose is the T-pose, after which the angles must be those of an arm in front of the body
-            EulerAngles(SHOULDER_AXES[side], SHOULDER_USUAL, margin=30.0),
+            EulerAngles(SHOULDER_AXES[side], SHOULDER_USUAL, margin=30.0, together=_SHOULDER_TOGETHER),
         )
         for side in _SIDES
     ]

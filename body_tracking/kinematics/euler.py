@@ -59,12 +59,15 @@ class EulerAngles:
             uncertainty grows. A continuous path around a singular pose can end in angles such as -180, 180, 180 deg for
             hanging arms: noise decides on which side of the pose an arm passes. Where hanging is the singular pose, an
             arm that swings back through it needs 60 deg (extension).
+        together: degrees, greatest usual sum of the absolute values of the first two angles. Of a rotation's two Cardan
+            triples one has a sum of s, the other one of about 360 - s: a sum near 360 stands for a small rotation.
     """
 
     axes: tuple[FloatArray, FloatArray, FloatArray]
     usual: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
     turn: FloatArray | None = None
     margin: float = 60.0
+    together: float = float("inf")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,6 +112,7 @@ class EulerSequences:
         self._low, self._high = usual[..., 0], usual[..., 1]
         self._centre = 0.5 * (self._low + self._high)
         self._margin = np.radians([sequence.margin for sequence in sequences])
+        self._together = np.radians([sequence.together for sequence in sequences])
 
     def split(self, rotations: FloatArray, variances: FloatArray, previous: FloatArray | None) -> Split:
         """Angles of rotations.
@@ -189,6 +193,7 @@ class EulerSequences:
 
     def _excess(self, angles: FloatArray) -> FloatArray:
         excess: FloatArray = np.maximum(np.maximum(angles - self._high, self._low - angles), 0.0)
+        excess[..., 1] += np.maximum(np.abs(angles[..., :2]).sum(axis=-1) - self._together, 0.0)
         return excess
 
     def _derivatives(self, parts: FloatArray, distance: FloatArray, hold: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -376,6 +376,23 @@ def test_an_arm_that_noise_rotates_beyond_its_range_keeps_its_direction() -> Non
             np.testing.assert_allclose(shoulder, [20.0, -34.0], atol=1e-6)
 
 
+@pytest.mark.parametrize("known", [8.0, 24.0])
+def test_an_arm_that_hangs_is_not_flexed_and_abducted_by_180_degrees(known: float) -> None:
+    """Seen on a real pair of Kinects (p02_90deg), the rotation of a straight arm far outside its range.
+
+    576 of 3,035 frames had angles such as (172, 170, 0) degrees for (-8, 10, 180), from an absence of the arm on.
+    """
+    before: JointAngles | None = None
+    for first in (None, (172.0, 170.0, 0.0)):
+        if first is not None:
+            before = angles_of(estimate(arms(*first), known * DEGREE), MODEL, "model", before)
+        before = angles_of(estimate(arms(-8.0, 10.0, 180.0), known * DEGREE), MODEL, "model", before)
+        values = by_name(before)
+        for side, _ in SIDES:
+            shoulder = np.degrees([values[f"shoulder_flexion_{side}"], values[f"shoulder_abduction_{side}"]])
+            np.testing.assert_allclose(shoulder, [-8.0, 10.0], atol=1e-6)
+
+
 def test_the_deviation_announces_a_jump_back_into_the_usual_ranges() -> None:
     """An arm that swings through hanging and on by 90 deg, farther than its elevation stays positive."""
     before: JointAngles | None = None
