@@ -54,16 +54,21 @@ def corrected_spine(skeleton: Skeleton) -> Skeleton:
     behind the side that it takes for the front. A fused frame has correct sides already.
 
     Args:
-        skeleton: in any frame; only its positions change, and only where both axes of the pelvis, or of the thorax, are
-            known.
+        skeleton: in any frame; only its positions change, and only where the axes of the pelvis or of the thorax are
+            known. Those of one stand for those of the other where that is not: a joint that moved back by centimetres
+            whenever a hip is missing would seem to have a velocity.
     """
     known = np.where(skeleton.valid[:, None], skeleton.positions, np.nan)
     base, middle, top, left_hip, right_hip, left_shoulder, right_shoulder = known.take(_NEEDED, axis=0).tolist()
     positions = skeleton.positions.copy()
-    forward, _, up = trunk_axes(middle, base, left_hip, right_hip)
-    if math.isfinite(forward[0]):
+    pelvis = trunk_axes(middle, base, left_hip, right_hip)
+    thorax = trunk_axes(top, middle, left_shoulder, right_shoulder)
+    if not math.isfinite(pelvis[0][0]):
+        pelvis = thorax
+    if not math.isfinite(thorax[0][0]):
+        thorax = pelvis
+    if math.isfinite(pelvis[0][0]):
+        forward, _, up = pelvis
         positions[_J.SPINE_BASE] += [BASE_FORWARD * f + BASE_UP * u for f, u in zip(forward, up, strict=True)]
-    forward, _, _ = trunk_axes(top, middle, left_shoulder, right_shoulder)
-    if math.isfinite(forward[0]):
-        positions[_UPPER] += [FORWARD * each for each in forward]
+        positions[_UPPER] += [FORWARD * each for each in thorax[0]]
     return replace(skeleton, positions=positions)
