@@ -85,7 +85,7 @@ class CalibrationStage(Stage):
 
     def start(self, now: Now) -> Iterable[Output]:
         update = self.calibration.current_update()
-        # Valid for all times, so without the drift of an earlier session: far from its anchor it would add up.
+        # Valid for all times, so stamped 0 and without drift: from an earlier session to 1970 it would make minutes.
         clocks = {sensor: replace(clock, drift_ppm=0.0) for sensor, clock in update.result.clocks.items()}
         return self._published([replace(update, result=replace(update.result, clocks=clocks))])
 

@@ -1,4 +1,4 @@
-"""Clock offsets come from motion alone: whatever the sensors' places, and not from the arrival of messages."""
+"""Clock offsets are estimated from motion, for any poses of the sensors; times of arrival are only a prior."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_a_periodic_motion_is_placed_next_to_the_guess() -> None:
 
 @pytest.mark.parametrize("offset", [0.0, 0.4, 2.0])
 def test_a_likely_correlation_is_no_more_than_the_correlation(offset: float) -> None:
-    """The same at the guess; far from it less, and the less motion there was the lesser."""
+    """Equal at the guess, smaller far from it, and the smaller the less motion there was."""
     long, short = (
         correlate_clocks(seen(0.0, 0.0, seconds, 1), seen(offset, 0.0, seconds, 2), 0.0, 3.0)
         for seconds in (24.0, 12.0)
@@ -78,7 +78,7 @@ def test_too_little_overlap_is_no_answer() -> None:
 def known(
     offset: float, drift: float, at: float, stddev: float = RECEIPT_PRIOR, drift_stddev: float = DRIFT_PRIOR
 ) -> ClockModel:
-    """A clock in seconds; by default as the times of receipt leave it."""
+    """A clock in seconds; by default with the deviations of one from times of receipt."""
     return ClockModel(round(offset * NANOSECONDS), 1e6 * drift, round(at * NANOSECONDS), stddev, 1e6 * drift_stddev)
 
 
@@ -89,7 +89,7 @@ def offset_at(clock: ClockModel, time: float) -> float:
 def fitted(
     offset: float, drift: float, seconds: float = 55.0, expected: ClockModel | None = None, repeated: int = 1
 ) -> ClockModel:
-    """By as many windows as there are, each taken once or as often as it is repeated."""
+    """The clock from windows of 5 s up to ``seconds``, each added ``repeated`` times."""
     return solved(seen(0.0, 0.0, 60.0, 4), seen(offset, drift, 60.0, 5), seconds, expected, repeated)
 
 
@@ -149,7 +149,7 @@ def test_a_shifted_stream_shifts_the_answer_by_as_much() -> None:
 
 
 def test_the_times_of_receipt_help_as_much_as_the_motion_leaves_open() -> None:
-    """The estimate is drawn to what they say, the less the more motion there was; to what cannot be, not at all."""
+    """They pull the estimate, by their share of the information; an offset beyond the fit's range is ignored."""
     for seconds in (15.0, 55.0):
         plain, drawn, other = (
             fitted(0.02, 0.0, seconds, None if expected is None else known(expected, 0.0, 2.0))

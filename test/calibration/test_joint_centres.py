@@ -103,7 +103,7 @@ def test_a_bone_that_is_not_seen_turns_nothing_and_without_a_thorax_nothing_is_t
 
 
 def drawn(rng: np.random.Generator) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What eq. (1) assumes: a T-pose as people hold it, offsets and what passes; points, offsets, variances."""
+    """Drawn from the model of eq. (1): measured points of a T-pose, offsets, and variances of the transient errors."""
     up, left = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
     points = np.full((N_JOINTS, 3), np.nan)
     spine = (Joint.SPINE_SHOULDER, Joint.SPINE_MID, Joint.SPINE_BASE)
@@ -143,7 +143,7 @@ def test_what_is_known_of_offsets_is_as_good_as_stated() -> None:
         local = posed(points, EYE) @ offsets[:, :, None]
         off = (found.local - local[:, :, 0]).reshape(-1)
         errors.append(off @ np.linalg.solve(found.covariance, off))
-    # chi-square in the mean; the body's axes are those of joints that are off, which the equations do not know
+    # the mean of chi-square; the measured axes come from displaced joints, which the equations neglect
     assert 0.85 < np.mean(distances) / expected < 1.15
     assert 0.85 < np.mean(errors) / (3 * len(LEARNT)) < 1.15
 
@@ -241,7 +241,7 @@ ODD = (
     + [(ODD, 1)],
 )
 def test_other_poses_teach_nothing(pose: FloatArray, refused: int) -> None:
-    """Nor one without a joint that matters; one that is refused is counted once."""
+    """Neither does a T-pose with a needed joint unseen; a refused pose is counted once."""
     counters: dict[str, int] = {}
     centres = JointCentres(counters)
     stamp_ns = held(centres, pose)
@@ -262,7 +262,7 @@ def test_who_moves_or_is_seen_for_a_moment_teaches_nothing() -> None:
     held(centres, POSES[5], start=10.6, seconds=1.0)
     held(centres, T_POSE, start=11.6, seconds=0.6)
     assert centres.offsets is None
-    # two moments with nothing between are not one
+    # two short poses with a gap between are not one held pose
     held(centres, T_POSE, start=20.0, seconds=0.5)
     held(centres, T_POSE, start=21.0, seconds=0.5)
     assert centres.offsets is None
@@ -311,7 +311,7 @@ def test_evidence_of_several_sensors_is_combined() -> None:
         both.update(replace(frame, stamp_ns=frame.stamp_ns + FRAME_NS // 2), "kinect2")
     assert both.offsets is not None
     assert one.offsets is not None
-    # two that saw the same know it better
+    # two sensors that saw the same leave less uncertainty
     assert both.offsets.share < one.offsets.share < 1.0
 
 

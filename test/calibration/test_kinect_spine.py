@@ -1,4 +1,4 @@
-"""Where a Kinect v2 sees the spine: what real people show, and that the correction is rigid with the body."""
+"""Correction of a Kinect v2's spine: on real people, and under rotation and mirroring of the body."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ def run(
     saved: CalibrationResult | None = None,
     **parameters: object,
 ) -> tuple[OnlineCalibration, list[CalibrationUpdate]]:
-    """The calibration after the frames, some of kinect2's changed, and its updates; what was saved is loaded before."""
+    """The calibration after the frames, kinect2's after ``change``, and its updates; ``saved`` is loaded first."""
     calibration = OnlineCalibration(("kinect1", "kinect2"), CalibrationParameters(**parameters))
     if saved is not None:
         calibration.load(saved)
@@ -229,7 +229,7 @@ def test_a_still_pose_starts_and_movement_refines() -> None:
 @pytest.mark.parametrize("turned", ["kinect1", "kinect2"])
 @pytest.mark.parametrize("seconds", some([5.0, 60.0]))
 def test_a_sensor_that_sees_the_body_turned_around_does_not_turn_the_pose(turned: str, seconds: float) -> None:
-    """Neither at first, when one still pose is all there is, nor ever after."""
+    """Neither at the start, from a single still pose, nor later."""
     frames = tuple(
         (name, seen.mirrored() if name == turned and now < seconds * NANOSECONDS else seen, now)
         for name, seen, now in stream(10.0)
@@ -276,9 +276,9 @@ def test_arrival_times_are_only_a_first_guess() -> None:
 
 
 def test_the_first_seconds_of_a_twist_do_not_move_the_clock_by_frames() -> None:
-    """Seen from its side it looks up to two frames late or early, by more than the times of receipt are wrong.
+    """Seen from its side, a twist looks up to two frames late or early: more than the error of the times of receipt.
 
-    Of 42 people a window of five seconds moves one person's clock even so, by 116 ms (seed 6).
+    Even so, a window of five seconds moves the clock of one of 42 people, by 116 ms (seed 6).
     """
     views = around(np.radians([45.0, -45.0]).tolist(), (2.0, 2.0), (1.0, 1.0))
     seeds = [1, *range(3, draws(4, 15))]
@@ -383,7 +383,7 @@ def test_a_saved_clock_is_known_better_than_from_motion_that_looks_different_fro
     last_ns = recording.frames[-1].skeletons[0].stamp_ns
 
     def off(saved: ClockModel | None, drift_stddev_ppm: float = 5.0) -> tuple[float, float]:
-        """The error of the clock at the end, and what is stated of it."""
+        """The error of the clock at the end, and its stated standard deviation."""
         calibration = OnlineCalibration(names)
         if saved is not None:
             quality = SensorQuality(0.03, 0.005, 0.01, 0.002, 500, drift_stddev_ppm)
@@ -431,7 +431,7 @@ def test_a_bag_that_loops_keeps_the_poses_and_says_no_more_of_the_clock() -> Non
 
 @pytest.mark.slow
 def test_a_clock_that_drifts_far_is_followed() -> None:
-    """Farther than windows of motion are compared at, with what was known before."""
+    """Beyond the search range of the windows of motion; the estimate so far becomes the prior."""
     drift, seconds = 500e-6, 360.0
     calibration, _ = run(stream(seconds, drift=drift))
     for result in (calibration.result(), calibration.finish()):

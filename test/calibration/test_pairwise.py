@@ -43,7 +43,7 @@ WALK = np.linspace(0.0, 25.0, 250)
 
 @pytest.mark.parametrize("seed", range(5))
 def test_movement_overcomes_a_constant_distortion(seed: int) -> None:
-    """What one still pose cannot: the error of the plain fit stays, that of the estimate goes."""
+    """The error of the plain fit stays, that of the estimate vanishes; one still pose cannot achieve that."""
     still, moving = pairs_of(STILL, 0.06, seed=seed, places=1), pairs_of(WALK, 0.06, seed=seed)
     plain, _ = rigid_registration(still.reference.mean(axis=0), still.sensor.mean(axis=0))
     found = estimate(moving, plain, np.zeros(3))

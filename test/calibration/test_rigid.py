@@ -1,4 +1,4 @@
-"""The registration recovers what was done, and never answers with a reflection."""
+"""The registration recovers a rigid motion, and never returns a reflection."""
 
 from __future__ import annotations
 

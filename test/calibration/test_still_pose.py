@@ -30,7 +30,7 @@ def repeated(noise: float = 0.008) -> np.ndarray:
 
 
 def test_a_noisy_still_pose_is_still() -> None:
-    """And no walk, nor too few frames or too slow ones, nor a body that is not seen."""
+    """A walk is not, nor are too few or too slow frames, nor an unseen body."""
     assert is_still(TIMES, repeated())
     assert not is_still(TIMES, walk(5.0 + TIMES))
     assert not is_still(TIMES[:-1], repeated()[:-1])

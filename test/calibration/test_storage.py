@@ -52,7 +52,7 @@ def test_a_calibration_survives_the_disk(tmp_path_factory: pytest.TempPathFactor
 
 
 def test_the_clock_of_a_file_is_published_as_the_offset_that_was_estimated(tmp_path: Path) -> None:
-    """What holds for all times carries no drift: by the time since 1970, 0.2 ppm make a clock six minutes wrong."""
+    """A clock that is valid for all times has no drift: 0.2 ppm over the time since 1970 would be six minutes."""
     path, now_ns = tmp_path / "room.yaml", 1_790_000_000 * NANOSECONDS
     result = example()
     for drift_ppm in (-300.0, -0.2, 0.0, 0.2, 300.0):

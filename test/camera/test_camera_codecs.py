@@ -1,4 +1,4 @@
-"""Images in colour and compressed ones: what is read is what was written, and hostile ones are refused."""
+"""Colour images and compressed ones: decoding inverts encoding, and hostile images are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The stage of ``camera_skeleton`` on the shipped recording: people, and what is said of images that are no use."""
+"""The stage of ``camera_skeleton`` on the shipped recording: people, and reports of unusable images."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def test_a_picture_of_a_person_gives_no_skeleton_and_is_named() -> None:
 @networks
 @pytest.mark.parametrize("virtual", [True, False])
 def test_somebody_in_a_mirror_is_another_person_or_a_picture(virtual: bool) -> None:
-    """Cameras that measure light's way see what is in a mirror behind it; others see the mirror itself."""
+    """Time-of-flight cameras see a mirrored person behind the mirror; other depth cameras see the mirror's surface."""
     node, recorded = calibrated(people=2), recording()
     stamp_ns = next(iter(recorded.colour))
     colour, depth = recorded.colour[stamp_ns], recorded.depth[stamp_ns]

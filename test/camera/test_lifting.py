@@ -1,4 +1,4 @@
-"""Joints from landmarks and a depth image: where they come out, and what is said of those that are hidden."""
+"""Joints from landmarks and a depth image: their positions, and the states of hidden ones."""
 
 from __future__ import annotations
 
@@ -159,5 +159,5 @@ def test_a_trunk_with_an_unknown_corner_has_no_depth(corner: str) -> None:
     unknown = replace(found, pixels=pixels)
     assert trunk_depth(unknown, depth) is None
     assert lift(unknown, depth, CAMERA) is None
-    # the other landmarks are too few points to say
+    # the other landmarks are too few points to decide
     assert not is_flat(unknown, depth, CAMERA)

@@ -1,4 +1,4 @@
-"""The networks' files: what is there and whole is not fetched again."""
+"""The networks' files: whole ones are not fetched again."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sensors that err just as they state, each joint by itself: what the angles behind the filter state is true."""
+"""Sensors whose joints have independent errors as stated: the deviations of the filtered angles are right."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from body_tracking.simulation.scene import Setup, SimulatedRecording, simulate
 from body_tracking.systems import STAGES, stage_class
 
 ACROSS, ALONG = 0.043, 0.03
-"""Metres: deviations across the line of sight, as published of a network, and along it."""
+"""Metres: standard deviations across the line of sight, as published for a network, and along it."""
 TIME_CONSTANT = 0.5
-"""Seconds, of half the variance; the other half stays."""
+"""Seconds: correlation time of half the variance; the other half is constant."""
 TRACKED = np.full(N_JOINTS, TrackingState.TRACKED, np.uint8)
 
 
@@ -50,7 +50,7 @@ def cameras(recording: SimulatedRecording, rng: np.random.Generator) -> Iterator
 
 
 def filtered(recording: SimulatedRecording, seed: int) -> list[Skeleton]:
-    """What the default filter makes of them."""
+    """The output of the default filter."""
     frames = sorted(cameras(recording, np.random.default_rng(seed)), key=lambda frame: frame.received_ns)
     names = tuple(sorted(sensor.pose.sensor for sensor in recording.sensors))
     found: list[Skeleton] = []
@@ -83,7 +83,7 @@ def covered(recording: SimulatedRecording, skeletons: list[Skeleton], of_bones: 
 
 @pytest.mark.slow
 def test_elbows_and_elevations_are_within_what_is_stated_if_the_joints_err_by_themselves() -> None:
-    """Were the errors of neighbouring joints alike, as a Kinect's, elbows would be so in two thirds of the frames."""
+    """With the correlation of a Kinect's joints, the bands of the elbows would cover two thirds of the frames."""
     names = [f"{name}_{side}" for name in ("elbow_flexion", "shoulder_elevation") for side in ("left", "right")]
     angles = [ANGLE_NAMES.index(name) for name in names]
     people = [simulate(Setup("reaching", layout(4), seed=900 + seed)) for seed in range(4)]

@@ -93,7 +93,7 @@ def test_a_clock_that_jumps_back_starts_anew_and_poses_hold() -> None:
     pushed(made, "kinect1", seen("kinect1", 5.0))
     pushed(made, "kinect1", seen("kinect1", 0.5))
     assert made.counters["resets"] == 1
-    # What waited for its time is in force: the recording began again.
+    # The pose that waited for its time is in force, because the recording began again.
     assert_allclose(pushed(made, "kinect2", seen("kinect2", 0.5)).positions, truth(np.array([0.5]))[0], atol=1e-9)
 
 
@@ -110,7 +110,7 @@ def test_a_sensor_with_a_wrong_clock_is_left_out_until_it_is_calibrated(off: flo
         if number == 40:
             made.set_clock("kinect2", round(time * NANOSECONDS), ClockModel(OFFSET_NS + round(off * NANOSECONDS)))
         taken.append(made.push("kinect2", other) is not None)
-    # Of one from the past that is clear at once, of one from the future when the reference's next frame comes.
+    # Stamps from the past are detected at once, those from the future at the reference's next frame.
     assert taken == [True] * 20 + [off > 0.0] + [False] * 19 + [True] * 20
 
 

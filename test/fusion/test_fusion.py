@@ -146,7 +146,7 @@ def test_output_is_independent_of_small_changes_of_arrival(seed: int) -> None:
 
 
 def test_a_frame_waits_only_for_one_that_is_due() -> None:
-    """The other sensor misses one frame: its neighbour waits, and not for longer than it may."""
+    """The other sensor misses one frame: the reference's frame waits for it, and not longer than ``max_wait``."""
     given_frames = frames(3.0, phase=0.016)
     missing = next(index for index, each in enumerate(given_frames) if index > 60 and each[0] == "kinect2")
     made = fusion(max_wait=0.01)

@@ -38,7 +38,7 @@ def test_expected_time_is_a_lower_bound_of_the_next_frame() -> None:
     assert ordering.expected_ns == first_ns + PERIOD - 2 * MS
     ordering.push("kinect1", frame(first_ns + PERIOD), first_ns + PERIOD)
     assert ordering.expected_ns == second_ns + PERIOD - 2 * MS
-    # a frame that waits for an older one is itself to come
+    # a frame that waits for an older one has not been released yet
     ordering.push("kinect1", frame(first_ns + 2 * PERIOD), first_ns + 2 * PERIOD)
     ordering.hold("kinect2", frame(first_ns + PERIOD + MS), first_ns + 2 * PERIOD)
     assert ordering.expected_ns == first_ns + PERIOD + MS
@@ -147,7 +147,7 @@ def test_no_frame_waits_for_a_vanished_sensor() -> None:
         at = now + 10 * MS + k * PERIOD
         waited += ordering.push("a", frame(at), at) == []
         ordering.poll(at + 20 * MS)
-    # both by patience and because what was silent for long is not expected any more
+    # by patience, and because no frame is expected of a sensor that was silent for long
     assert 1 <= waited <= PATIENCE
 
 

@@ -19,7 +19,7 @@ WEIGHTS = [[50.0, 10.0]] * 4
 
 
 def accepted_headings(seconds: float, seen: Mapping[str, tuple[float, float]], hold: float = HOLD) -> list[float]:
-    """The upper body's heading while sensors see it turned round in a part of the time, relative to what it is.
+    """The error of the upper body's heading while sensors see the body turned round for part of the time.
 
     Args:
         seconds: how long it lasts, 30 times a second.

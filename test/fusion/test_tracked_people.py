@@ -25,13 +25,13 @@ OFF = 3.5
 _ABOUT = Rotation.from_euler("z", 180.0, degrees=True) * Rotation.from_matrix(level_pose("kinect2").rotation)
 POSES = {
     "kinect1": level_pose("kinect1"),
-    # 4 m ahead and turned about, so that it has near what the first one has far
+    # 4 m ahead and turned round, so that people near the first sensor are far from this one
     "kinect2": SensorPose("kinect2", np.array([4.0, 0.0, 0.0]), _ABOUT.as_quat()),
 }
 
 
 def seen(sensor: str, time: float, places: dict[int, tuple[float, float]]) -> list[Skeleton]:
-    """What a sensor sees of people who stand at (x, y) in world, by its numbers of them."""
+    """A sensor's skeletons of people who stand at (x, y) in world, by its body numbers."""
     pose = POSES[sensor]
     result = []
     for number, place in sorted(places.items()):

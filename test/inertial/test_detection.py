@@ -33,7 +33,7 @@ UPPER_LOWER = [0, 2, 1, 3, 4]
 
 
 def turnings(seed: int, noise: float) -> tuple[list[Series], list[Series]]:
-    """The rates of sensors and of bones: each limb moves in its own way, a forearm with its upper arm besides."""
+    """The rates of sensors and of bones: each limb has a motion of its own, a forearm also that of its upper arm."""
     rng = np.random.default_rng(seed)
     times = np.arange(0.0, 40.0, 0.02)
     knots = np.arange(0.0, 41.0, 0.4)
@@ -76,7 +76,7 @@ def test_a_pose_of_sensors_with_magnetometers_tells_left_from_right(seed: int, o
 @settings(max_examples=draws(8, 15), deadline=None)
 @given(st.integers(0, 2**31))
 def test_a_t_pose_of_both_forearms_alone_exchanges_nothing(seed: int) -> None:
-    """The same pose half a turn on has left and right exchanged: nothing says which way the person faces."""
+    """Exchanged sensors fit the pose turned by half a turn, and the person's heading is unknown."""
     arms = [WORN.index("forearm_left"), WORN.index("forearm_right")]
     names = tuple(WORN[number] for number in arms)
     measured = held(np.random.default_rng(seed), [0, 1, 2, 3, 4])[arms]
@@ -85,7 +85,7 @@ def test_a_t_pose_of_both_forearms_alone_exchanges_nothing(seed: int) -> None:
 
 
 def test_limbs_that_move_alike_are_not_exchanged() -> None:
-    """Each sensor fits the other's bone as well as its own; what is left are errors of the camera."""
+    """Each sensor fits the other's bone as well as its own; the difference is only the camera's error."""
     for seed in range(20):
         rng = np.random.default_rng(seed)
         (one, *_), _ = turnings(seed, 0.0)

@@ -42,7 +42,7 @@ def arm(times: FloatArray, rng: np.random.Generator) -> FloatArray:
 
 
 class Wearer:
-    """A left arm with two sensors: what is true, and a start that is off by as much as it states."""
+    """A left arm with two sensors: the true state, and an initial alignment with errors as stated."""
 
     def __init__(self, seed: int, seconds: float, heading_stddev: float, walk: float = 0.0) -> None:
         self.rng = rng = np.random.default_rng(seed)
@@ -60,7 +60,7 @@ class Wearer:
         return yaw(-self.psi[instant]) @ self.world[instant] @ self.true.swapaxes(-1, -2)
 
     def error(self, alignment: Alignment, instant: int) -> FloatArray:
-        """(8,) as of the covariance."""
+        """(8,) errors in the coordinates of the covariance."""
         turned = so3.rotation_vectors(alignment.rotations.swapaxes(-1, -2) @ self.true)
         apart = wrapped(self.psi[instant] - alignment.headings)
         return np.concatenate([turned, apart[:, None]], axis=1).reshape(-1)
@@ -73,7 +73,7 @@ class Wearer:
 def see_bones(
     wearer: Wearer, tracker: HeadingTracker, instant: int, sensors: FloatArray, stddev: float, errors: FloatArray
 ) -> None:
-    """Both bones, off by these errors, (2, 3) in units of their deviation."""
+    """Observe both bones with these errors, (2, 3) in units of their standard deviation."""
     for number, name in enumerate(ARM):
         bone = bone_of(name)
         assert bone is not None
@@ -158,7 +158,7 @@ def test_the_trunks_joints_have_ranges_too(child: str) -> None:
     upright = Alignment((parent, child), np.tile(np.eye(3), (2, 1, 1)), np.zeros(2), 0.1 * np.eye(8))
     tracker = HeadingTracker(upright)
     assert tracker.observe_range(0.0, parent, child, (np.eye(3), np.eye(3))) is None
-    # turned half around against the other: what they share stays, what is between them shrinks
+    # turned far against the other: the common heading stays, the difference shrinks
     found = tracker.observe_range(1.0, parent, child, (np.eye(3), yaw(2.5)))
     assert found is not None
     assert abs(tracker.alignment.headings[1] - tracker.alignment.headings[0]) > 0.1

@@ -1,4 +1,4 @@
-"""Readings of inertial sensors: what is wrong with one is said when it is made, what is wrong with many, once."""
+"""Readings of inertial sensors: an invalid one raises an error, problems of many readings are reported once."""
 
 from __future__ import annotations
 

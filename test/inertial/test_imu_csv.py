@@ -1,4 +1,4 @@
-"""Inertial readings as separated values: every layout says the same in REP-145's units, or says where it does not."""
+"""Inertial readings as separated values: every layout is converted to REP-145's units; errors name file and line."""
 
 from __future__ import annotations
 
@@ -135,5 +135,5 @@ def test_the_pendulum(shared_data: Path) -> None:
     first = readings[0].sample
     np.testing.assert_allclose(first.acceleration, [9.7412, 0.11035, 0.13574])
     np.testing.assert_allclose(first.magnetic_field, np.array([-0.89844, -0.45703, 0.37207]) * 50e-6)
-    # by now it would be 15630 of 89.8 Hz, were each row a reading
+    # if each row were a reading, there would be 15630, at 89.8 Hz
     assert 45.0 < len(readings) / 174.1 < 55.0

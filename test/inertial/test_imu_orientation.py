@@ -1,4 +1,4 @@
-"""Orientation from raw data: where nothing errs it is the truth, elsewhere its covariance says how far it is off."""
+"""Orientation from raw data: exact without errors, and with errors within its stated covariance."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def pivot(times: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def swing(times: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The same, and the sensor goes to and fro by 10 cm, with up to 3 m/s2."""
+    """As :func:`pivot`, while the sensor goes to and fro by 10 cm, with up to 3 m/s2."""
     way = 0.1 * np.stack([np.sin(4.0 * times), np.sin(3.0 * times), np.sin(2.5 * times)], axis=1)
     return pivot(times)[0], 1.0 + way
 
@@ -74,9 +74,9 @@ def sample(samples: ImuSamples, k: int, magnetic: bool = False) -> ImuSample:
 
 
 class Run:
-    """What an estimator makes of samples; errors in the earth frame, degrees.
+    """An estimator's errors over samples, in degrees about the earth's axes.
 
-    Tilt (n, 2), heading (n,), of which without magnetometer the first is taken out, and their deviations.
+    Tilt (n, 2), heading (n,), without magnetometer relative to its first error, and their standard deviations.
     """
 
     def __init__(self, samples: ImuSamples, magnetic: bool = False, errors: InertialErrors | None = None) -> None:
@@ -151,7 +151,7 @@ def test_deviations_cover_the_errors(magnetic: bool) -> None:
     heading = np.concatenate([np.abs(run.heading / np.maximum(run.heading_stddev, 0.1)) for run in runs])
     assert (tilt < 2.0).mean() > 0.95
     assert (heading < 2.0).mean() > 0.95
-    # and are no wild guesses
+    # and are not needlessly large
     assert np.median(np.concatenate([run.tilt_stddev for run in runs])) < 4.0
     for run in runs:
         if run.estimator.restarts:
@@ -280,7 +280,7 @@ def test_a_real_pendulum(shared_data: Path) -> None:
     columns = columns[inside][::4]
     ours = course(columns[:, 0]).as_matrix()
     vicon = Rotation.from_quat(columns[:, [2, 3, 4, 1]]).as_matrix()
-    # vicon = world @ ours @ mounting, by turns; the mounting starts as what fits the first instant
+    # vicon = world @ ours @ mounting, both fitted in turn; the mounting starts from the first instant
     world, mounting = np.eye(3), ours[0].T @ vicon[0]
     products = np.tensordot(vicon, ours, (0, 0))  # all that the sums over the instants below need
     for _ in range(400):  # slowly: it turns mostly about one axis

@@ -1,4 +1,4 @@
-"""Poses and movements align sensors: exactly without errors, and within what is stated with them."""
+"""Poses and movements align sensors: exactly without errors, and within the stated deviations with errors."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def random_rotations(rng: np.random.Generator, count: int, size: float = 2.0) ->
 
 
 def worn(rng: np.random.Generator, pose: FloatArray, covariance: FloatArray, mounting: float) -> tuple[FloatArray, ...]:
-    """Meant and true mountings, headings, and what is measured of people who are off the pose by a covariance."""
+    """Intended and true mountings, headings, and measurements of people whose pose errs by a covariance."""
     k = len(pose)
     meant = random_rotations(rng, k)
     true = meant @ random_rotations(rng, k, mounting)
@@ -107,7 +107,7 @@ def test_without_known_mountings_the_pose_is_right_and_the_alignment_up_to_the_h
 
 
 def stream(segment: str, times: FloatArray, angles: FloatArray, off: float = 0.0) -> Stream:
-    """Of a segment that turns about x, with rates that are off by so much."""
+    """The stream of a segment that turns about x; ``off`` is an error of its rates."""
     rates = np.zeros((len(times), 3))
     rates[:, 0] = np.gradient(angles, times)
     return Stream(segment, times, so3.quat_to_matrix(so3.exp(angles[:, None] * [1.0, 0.0, 0.0])), rates + off)

@@ -1,4 +1,4 @@
-"""A clock's offset is found from turning alone, with an honest deviation, and not where the motion cannot tell."""
+"""A clock's offset is estimated from turning rates, with a consistent deviation, if the motion determines it."""
 
 from __future__ import annotations
 

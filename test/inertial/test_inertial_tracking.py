@@ -25,7 +25,7 @@ from body_tracking.simulation.scene import START_NS
 from draws import draws
 
 SECONDS = 22.0
-"""Of people who reach out in all directions: about the shortest that there is."""
+"""Duration of recordings of people who reach out in all directions: about the shortest that works."""
 WORN = ("upper_trunk", "upper_arm_left", "forearm_left", "upper_arm_right", "forearm_right")
 STILL = np.zeros(3)
 
@@ -51,7 +51,7 @@ def test_orientations_of_two_forearms_with_a_camera_are_within_their_stated_devi
     for segment in FOREARMS:
         assert covered(wrists, segment, 4.0).mean() > 0.95
         error, _ = wrists.errors(segment, 4.0)
-        # pronation turns by 150 degrees in this movement; what is off is hardly more than the alignment's own error
+        # pronation turns by 150 degrees in this movement; the error is hardly more than the alignment's own
         assert np.degrees(np.sqrt((error**2).mean())) < 12.0
     assert wrists.tracker.counters["alignments by a pose"] == 1
     assert "T-pose" in wrists.tracker.align()
@@ -62,7 +62,7 @@ def test_orientations_have_the_cameras_clock_correct_rates_and_at_most_the_reque
     for segment in FOREARMS:
         published = [each for each in wrists.orientations if each.segment == segment]
         steps = np.diff([each.stamp_ns for each in published]) / NANOSECONDS
-        # of 50 readings a second every second one is no more often than 30 times
+        # every second one of 50 readings per second is published: at most 30 per second
         assert (steps > 0.8 / TrackingParameters().orientation_rate).all()
         assert np.median(steps) == pytest.approx(2.0 / 50.0, rel=0.1)
         # the rate is that at which the orientation changes
@@ -130,7 +130,7 @@ def test_two_exchanged_sensors_are_reported_and_reassigned(wrists: Fed) -> None:
 
 @pytest.mark.slow
 def test_a_pose_alone_names_no_swap_of_wrist_sensors() -> None:
-    """A T-pose with swapped sensors is one half a turn on, and nobody knows where north is: motion has to tell them."""
+    """A T-pose with swapped sensors equals one turned by half a turn; without north only motion distinguishes them."""
     for seed in range(draws(2, 20)):
         for worn in (FOREARMS, FOREARMS[::-1]):
             imus = tuple(sensor(name, on, magnetometer=True) for name, on in zip(FOREARMS, worn, strict=True))
@@ -236,7 +236,7 @@ def test_magnetometers_share_their_heading_so_that_a_pose_finds_straps_that_are_
 
 @pytest.mark.parametrize("rate", [None, np.array([0.1, 0.0, 0.0])], ids=["none", "some"])
 def test_no_rate_is_published_that_the_driver_does_not_report(rate: FloatArray | None) -> None:
-    """The difference of two orientations is too rough to be taken for a measurement."""
+    """The difference of two orientations is too noisy to count as a measurement."""
     tracker = aligned_by_magnetometers()
     for k in range(2):
         output = output_later(tracker, k * NANOSECONDS // 20, rate, np.array([0.005 * k, 0.0, 0.0])).orientation
@@ -252,7 +252,7 @@ def test_no_body_is_fitted_without_a_subscriber() -> None:
 
 
 def test_stamps_that_jitter_cost_no_orientations() -> None:
-    """Of 100 readings a second every third one has an orientation: that is as good as 30 times a second."""
+    """Every third of 100 readings per second gives an orientation, although that is slightly more than 30 Hz."""
     tracker = aligned_by_magnetometers()
     jitter = np.random.default_rng(0).integers(-1_000_000, 1_000_000, 300).tolist()
     stamps = [k * NANOSECONDS // 100 + off for k, off in enumerate(jitter)]

@@ -1,4 +1,4 @@
-"""Orientations of segments give the configuration back, with a covariance that says what no sensor sees."""
+"""Orientations of segments give the configuration back, with large variances where no sensor observes it."""
 
 from __future__ import annotations
 

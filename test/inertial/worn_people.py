@@ -38,7 +38,7 @@ def recorded(
 
 
 def samples_of(imu: SimulatedImu, samples: ImuSamples) -> list[tuple[int, str, ImuSample]]:
-    """Receipt, segment that is stated, reading."""
+    """(time of receipt, stated segment, reading) of each sample."""
     found = []
     for k, stamp_ns in enumerate(samples.stamps_ns.tolist()):
         sample = ImuSample(
@@ -56,7 +56,7 @@ def samples_of(imu: SimulatedImu, samples: ImuSamples) -> list[tuple[int, str, I
 
 @dataclass(eq=False)
 class Fed:
-    """What a tracker made of a recording."""
+    """A tracker's outputs for a recording."""
 
     tracker: InertialTracker
     recording: SimulatedRecording
@@ -101,7 +101,7 @@ def feed(
         recording: of one person.
         parameters: of the tracker; by default with fewer skeletons than usual, which take their time, and with all
             orientations.
-        meddle: what becomes of a reading, at seconds from the beginning.
+        meddle: changes a reading, given the seconds from the beginning.
         camera_stddev: metres, of a camera with white noise in the place of the simulated one.
         seconds: how much of the recording is fed.
     """
