@@ -20,7 +20,7 @@ from typing import Final, Literal
 
 from body_tracking.core import names
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.core.message_types import IMU, JOINT_STATE, POINT_CLOUD
+from body_tracking.core.message_types import COMPRESSED_IMAGE, IMAGE, IMU, JOINT_STATE, POINT_CLOUD
 from body_tracking.pipeline import graph
 
 OK: Final = "OK"
@@ -45,6 +45,9 @@ _REMEDIES = {
 """By a part of the client library's error message."""
 LEAST_RATE = {POINT_CLOUD: 20.0, JOINT_STATE: 20.0, IMU: 50.0}
 """Hertz: a Kinect has 30, and 15 in the dark; with less than 50 the orientation of an IMU drifts."""
+_CAMERAS = "--camera, --camera-rig, --depth or --marker-setup"
+_OPTIONS = {IMAGE: _CAMERAS, COMPRESSED_IMAGE: _CAMERAS, IMU: "--imus"}
+"""By the type of a topic: the options that take it, as its name does not say which."""
 GAP = 0.5
 """Seconds without a frame after which calibration and filter have lost the person."""
 
@@ -133,17 +136,24 @@ def bag(path: Path) -> Iterator[Finding]:
     namespace = names.rig_namespace(topic.name for topic in info.topics)
     clouds = (topic.name for topic in info.topics if topic.type == POINT_CLOUD and topic.count)
     sensors = graph.sensors_among(names.within(name, namespace) or name for name in clouds)
-    if not sensors:
+    others = [topic.name for topic in info.topics if topic.type in _OPTIONS and topic.count]
+    options = sorted({_OPTIONS[topic.type] for topic in info.topics if topic.name in others})
+    if not sensors and others:
+        found = f"no skeletons on /<sensor>/skeleton, but {', '.join(others)}"
+        yield Finding(WARNING, f"{path}: {found}", f"give up or replay the option that takes them: {', '.join(options)}")
+    elif not sensors:
         found = f"no skeletons on /<sensor>/skeleton; topics: {', '.join(topic.name for topic in info.topics)}"
         yield Finding(PROBLEM, f"{path}: {found}", "record the sensors' topics; docs/recordings.md has other formats")
     skeletons = {names.resolved(graph.skeleton_topic(sensor), namespace) for sensor in sensors}
     for topic in info.topics:
-        if topic.name in skeletons or topic.type == IMU:
+        if topic.name in skeletons or topic.name in others:
             rate, gap = topic.rate or 0.0, topic.longest_gap or 0.0
             text, remedy = f"{topic.name}: {topic.count} messages, {rate:.1f} Hz, longest gap {gap:.2f} s", ""
-            if gap > GAP:
+            if gap > GAP and topic.name in others:
+                remedy = "check the driver and the cable: in a gap nothing is measured"
+            elif gap > GAP:
                 remedy = "keep the person in view: in a gap angles are predicted, then lost"
-            elif rate < LEAST_RATE[topic.type]:
+            elif rate < LEAST_RATE.get(topic.type, 0.0):
                 remedy = "more light, USB 3, the driver's settings: at this rate estimates are less certain"
             yield Finding(WARNING if remedy else OK, text, remedy)
 

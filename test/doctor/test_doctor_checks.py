@@ -102,6 +102,15 @@ def test_gaps_and_missing_sensors_of_a_bag_are_named(tmp_path: Path) -> None:
     assert "no skeletons" in found
 
 
+@pytest.mark.parametrize("name", ["markers_arm", "cameras_turning", "camera_reaching", "mesh_reaching", "five_systems"])
+def test_a_recording_of_another_system_is_no_problem(name: str) -> None:
+    """Images and inertial sensors give angles, too; where they are alone, an option says which system takes them."""
+    level, found = worst(bag(BAG.with_name(name)))
+    assert level == (OK if name in ("mesh_reaching", "five_systems") else WARNING)
+    if level == WARNING:
+        assert found.startswith(f"{BAG.with_name(name)}: no skeletons on /<sensor>/skeleton, but /")
+
+
 def test_the_exit_code_is_nonzero_for_a_problem(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["doctor", "--bag", str(BAG)]) == 0
     assert "0 problems, 0 warnings" in capsys.readouterr().out
