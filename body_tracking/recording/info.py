@@ -101,7 +101,7 @@ def _qos_text(offers: tuple[Qos, ...]) -> str:
 
 def _print(info: BagInfo) -> None:
     size = sum(info.files.values())
-    start = datetime.fromtimestamp(info.start_ns / NANOSECONDS, UTC)
+    start = datetime.fromtimestamp(round(info.start_ns / NANOSECONDS, 3), UTC)  # the seconds agree with those beside
     print(f"bag       {info.path}")
     print(f"files     {', '.join(info.files)} ({size / 1e6:.2f} MB)")
     print(f"start     {info.start_ns / NANOSECONDS:.3f} s ({start:%Y-%m-%d %H:%M:%S} UTC)")

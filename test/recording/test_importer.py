@@ -160,6 +160,13 @@ def test_import_and_info_as_json_and_for_people(tmp_path, capsys):
     assert "/kinect1/skeleton" in out and "best_effort" in out and "4" in out
 
 
+def test_the_date_of_the_start_agrees_with_its_seconds(tmp_path, capsys):
+    """Both are rounded: a recording of a simulation begins some nanoseconds before a whole second."""
+    run(capsys, "import", frames(tmp_path / "a.csv", 59.9997, 60.5), "-o", tmp_path / "bag")
+    _, out, _ = run(capsys, "bag", "info", tmp_path / "bag")
+    assert "60.000 s (1970-01-01 00:01:00 UTC)" in out
+
+
 def test_a_truncated_recording_is_reported_and_closed(tmp_path, capsys):
     rows = [csv_row(index / 30, index * 0.123) for index in range(1000)]
     import_files([write_csv(tmp_path / "a.csv", rows)], tmp_path / "bag")
