@@ -188,7 +188,7 @@ class BagReader:
                         raise
                     self._notes.append(str(error))
             if not self.files:
-                raise BagError(self._notes[-1] if _files(self.path) else f"{self.path}: no mcap file is in the folder")
+                raise BagError(self._notes[-1] if _files(self.path) else _no_file_in(self.path))
         except BaseException:
             self.close()
             raise
@@ -581,6 +581,13 @@ def remove_file(path: Path) -> None:
     with contextlib.suppress(OSError):
         path.unlink(missing_ok=True)
         path.parent.rmdir()
+
+
+def _no_file_in(folder: Path) -> str:
+    """Why a folder without mcap files is no recording; it may hold recordings."""
+    inner = sorted(each.name for each in folder.iterdir() if each.is_dir() and any(each.glob("*.mcap")))
+    hint = f"; give one of the recordings in it: {', '.join(inner)}" if inner else ""
+    return f"{folder}: no mcap file is in the folder{hint}"
 
 
 def recover(folder: Path | str) -> BagReader:

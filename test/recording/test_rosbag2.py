@@ -426,6 +426,14 @@ def test_files_that_are_no_recordings_are_refused_in_one_line(tmp_path):
         assert "\n" not in str(caught.value) and name in str(caught.value)
 
 
+def test_a_folder_of_recordings_names_them(tmp_path):
+    for name in ("b", "a"):
+        write(tmp_path / name, messages(1))
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(BagError, match=r"no mcap file is in the folder; give one of the recordings in it: a, b$"):
+        BagReader(tmp_path)
+
+
 # --- writing
 
 
