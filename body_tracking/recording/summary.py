@@ -46,12 +46,10 @@ def _poses(bag: BagReader) -> Iterator[str]:
     for sensor, pose in sorted(poses.items()):
         x, y, z = pose.translation
         ahead = pose.rotation[:, 2]
-        heading, down = 0.0 + np.round(
-            np.degrees([np.arctan2(ahead[1], ahead[0]), np.arcsin(np.clip(-ahead[2], -1.0, 1.0))])
-        )
+        left, down = np.round(np.degrees([np.arctan2(ahead[1], ahead[0]), np.arcsin(np.clip(-ahead[2], -1.0, 1.0))]))
         yield (
-            f"{sensor}: at x {x:.2f}, y {y:.2f}, z {z:.2f} m of world, looks {heading:.0f} deg to the left of x and "
-            f"{down:.0f} deg down"
+            f"{sensor}: at x {x:.2f}, y {y:.2f}, z {z:.2f} m of world, looks {abs(left):.0f} deg to the "
+            f"{'right' if left < 0.0 else 'left'} of x and {abs(down):.0f} deg {'up' if down < 0.0 else 'down'}"
         )
 
 
