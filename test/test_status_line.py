@@ -21,6 +21,7 @@ def test_problems_are_named_by_their_nodes() -> None:
     found = {
         "imu_skeleton": NodeStatus("imu_skeleton: state", 1, "forearm_left: not aligned"),
         "calibration": NodeStatus("calibration: state", 1, "waiting for a still pose"),
+        "robot_commands": NodeStatus("robot_commands: state", 1, "stopped: no angles yet"),  # named after "robot"
         "fusion": NodeStatus("fusion: state", 0, "fusing"),
         "bag_player": NodeStatus("bag_player: bag", 2, ""),
     }

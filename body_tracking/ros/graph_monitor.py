@@ -40,9 +40,12 @@ def calibration_part(status: NodeStatus | None, sensors: Collection[str]) -> lis
     return [f"calibration: {status.text if status is not None else 'none'}"]
 
 
+_OWN_PART = ("calibration", "robot_commands")
+
+
 def problem_parts(statuses: Mapping[str, NodeStatus]) -> list[str]:
-    """The problems that nodes report, with their names; not those of the calibration, which has a part of its own."""
-    bad = {name: each.text for name, each in statuses.items() if each.level and each.text and name != "calibration"}
+    """The problems that nodes report, with their names; not those of nodes that have a part of their own."""
+    bad = {name: each.text for name, each in statuses.items() if each.level and each.text and name not in _OWN_PART}
     return [f"{name}: {text}" for name, text in sorted(bad.items())]
 
 
