@@ -29,7 +29,7 @@ def test_problems_are_named_by_their_nodes() -> None:
     monitor = object.__new__(GraphMonitor)  # without a node
     monitor._statuses, monitor.angles = found, 0
     options = {"bag": "arm", "record": None}
-    end = "played arm for 3.0 s: 0 frames of joint angles"
+    end = "played arm in 3.0 s with start and end: 0 frames of joint angles"
     assert monitor.summary(options, 3.0, {}) == f"{end} (imu_skeleton: forearm_left: not aligned)"
     monitor.angles = 7
-    assert monitor.summary(options, 3.0, {}) == "played arm for 3.0 s: 7 frames of joint angles"
+    assert monitor.summary(options, 3.0, {}) == "played arm in 3.0 s with start and end: 7 frames of joint angles"

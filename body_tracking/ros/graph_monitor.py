@@ -29,6 +29,8 @@ from body_tracking.pipeline.system import Options
 from body_tracking.ros.bag_topics import to_profile
 
 _CHAIN = ("skeleton_filter", "joint_angles")
+_OWN_PART = ("calibration", "robot_commands")
+"""Nodes that have a part of their own in the status line."""
 _FRESH = 3.0
 """Seconds for which a node's diagnostics are valid."""
 
@@ -38,9 +40,6 @@ def calibration_part(status: NodeStatus | None, sensors: Collection[str]) -> lis
     if status is None and not sensors:
         return []
     return [f"calibration: {status.text if status is not None else 'none'}"]
-
-
-_OWN_PART = ("calibration", "robot_commands")
 
 
 def problem_parts(statuses: Mapping[str, NodeStatus]) -> list[str]:
@@ -204,8 +203,9 @@ class GraphMonitor:
 
     def summary(self, options: Options, elapsed: float, restarts: Mapping[str, int]) -> str:
         """The last line of a run."""
-        what = f"played {options['bag']}" if options["bag"] else "ran"
-        text = f"{what} for {elapsed:.1f} s: {self.angles} frames of joint angles"
+        seconds = f"{elapsed:.1f} s"
+        what = f"played {options['bag']} in {seconds} with start and end" if options["bag"] else f"ran for {seconds}"
+        text = f"{what}: {self.angles} frames of joint angles"
         problems = () if self.angles else problem_parts(self._statuses)
         text += f" ({'; '.join(problems)})" if problems else ""
         if options["record"]:
