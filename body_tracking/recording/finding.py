@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
 import body_tracking
+from body_tracking.core.message_types import COMPRESSED_IMAGE, IMAGE, IMU
 from body_tracking.core.parameters import Value
 
 SETUPS: Final[Mapping[str, Mapping[str, Value]]] = {
@@ -16,6 +17,16 @@ SETUPS: Final[Mapping[str, Mapping[str, Value]]] = {
     "mesh_reaching": {"depth": ("kinect1",)},
 }
 """Options of ``up`` for those shipped recordings whose topics do not determine them."""
+
+_CAMERAS = "--camera, --camera-rig, --depth or --marker-setup"
+TAKEN_BY: Final[Mapping[str, str]] = {IMAGE: _CAMERAS, COMPRESSED_IMAGE: _CAMERAS, IMU: "--imus"}
+"""The options of ``up`` and ``replay``, by the types of topics whose names do not say which system takes them."""
+
+
+def options_for_types(types: Iterable[str]) -> str:
+    """What to give for a recording of these types without skeletons; empty if nothing takes them."""
+    options = sorted({TAKEN_BY[each] for each in types if each in TAKEN_BY})
+    return f"give up or replay the option that takes them: {', '.join(options)}" if options else ""
 
 
 def is_bag(path: Path) -> bool:

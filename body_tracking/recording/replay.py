@@ -30,6 +30,7 @@ from body_tracking.pipeline.offline import OfflineRunner
 from body_tracking.pipeline.people import SubjectSelector
 from body_tracking.pipeline.system import Options
 from body_tracking.recording import forked
+from body_tracking.recording.finding import options_for_types
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader
@@ -140,12 +141,13 @@ class ReplayReport:
     warnings: tuple[str, ...]
 
 
-def sensor_topics(bag: BagReader, wanted: Sequence[str] = ()) -> dict[str, str]:
+def sensor_topics(bag: BagReader, wanted: Sequence[str] = (), advice: str = "") -> dict[str, str]:
     """The skeleton topics of a bag's sensors.
 
     Args:
         bag: open.
         wanted: sensor names; all in the bag when empty.
+        advice: said where the bag has no sensor at all.
 
     Returns:
         Sensor name by topic.
@@ -158,7 +160,8 @@ def sensor_topics(bag: BagReader, wanted: Sequence[str] = ()) -> dict[str, str]:
     missing = [name for name in names if name not in there]
     if missing or not names:
         what = f"no topic {graph.skeleton_topic(missing[0])}" if missing else "no topic /<sensor>/skeleton"
-        raise ReplayError(f"{bag.path}: {what}; it holds {', '.join(sorted(bag.topics)) or 'no topics'}")
+        hint = f"; {advice}" if advice and not there else ""
+        raise ReplayError(f"{bag.path}: {what}; it holds {', '.join(sorted(bag.topics)) or 'no topics'}{hint}")
     for name in names:
         kind = bag.topics[graph.skeleton_topic(name)].type_name
         if kind != POINT_CLOUD:
@@ -209,7 +212,8 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
     """
     began = time.perf_counter()
     with RigReader(bag_path) as bag:
-        topics = {} if _without(settings, bag) else sensor_topics(bag, settings.sensors)
+        advice = options_for_types(each.type_name for each in bag.topics.values())
+        topics = {} if _without(settings, bag) else sensor_topics(bag, settings.sensors, advice)
         settings = replace(settings, sensors=tuple(topics.values()))
         truth = [topic for topic in bag.topics if topic.startswith("/ground_truth/")]
         try:

@@ -20,7 +20,7 @@ from typing import Final, Literal
 
 from body_tracking.core import names
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.core.message_types import COMPRESSED_IMAGE, IMAGE, IMU, JOINT_STATE, POINT_CLOUD
+from body_tracking.core.message_types import IMU, JOINT_STATE, POINT_CLOUD
 from body_tracking.pipeline import graph
 
 OK: Final = "OK"
@@ -45,9 +45,6 @@ _REMEDIES = {
 """By a part of the client library's error message."""
 LEAST_RATE = {POINT_CLOUD: 20.0, JOINT_STATE: 20.0, IMU: 50.0}
 """Hertz: a Kinect has 30, and 15 in the dark; with less than 50 the orientation of an IMU drifts."""
-_CAMERAS = "--camera, --camera-rig, --depth or --marker-setup"
-_OPTIONS = {IMAGE: _CAMERAS, COMPRESSED_IMAGE: _CAMERAS, IMU: "--imus"}
-"""By the type of a topic: the options that take it, as its name does not say which."""
 GAP = 0.5
 """Seconds without a frame after which calibration and filter have lost the person."""
 
@@ -118,6 +115,7 @@ def clock() -> Finding:
 def bag(path: Path) -> Iterator[Finding]:
     """Findings on a folder or a single mcap file."""
     # these need libraries whose absence the doctor has to name
+    from body_tracking.recording.finding import TAKEN_BY, options_for_types
     from body_tracking.recording.info import bag_info
     from body_tracking.recording.rosbag2 import UnsupportedBagError
 
@@ -136,11 +134,10 @@ def bag(path: Path) -> Iterator[Finding]:
     namespace = names.rig_namespace(topic.name for topic in info.topics)
     clouds = (topic.name for topic in info.topics if topic.type == POINT_CLOUD and topic.count)
     sensors = graph.sensors_among(names.within(name, namespace) or name for name in clouds)
-    others = [topic.name for topic in info.topics if topic.type in _OPTIONS and topic.count]
-    options = sorted({_OPTIONS[topic.type] for topic in info.topics if topic.name in others})
+    others = {topic.name: topic.type for topic in info.topics if topic.type in TAKEN_BY and topic.count}
     if not sensors and others:
         found = f"no skeletons on /<sensor>/skeleton, but {', '.join(others)}"
-        yield Finding(WARNING, f"{path}: {found}", f"give up or replay the option that takes them: {', '.join(options)}")
+        yield Finding(WARNING, f"{path}: {found}", options_for_types(others.values()))
     elif not sensors:
         found = f"no skeletons on /<sensor>/skeleton; topics: {', '.join(topic.name for topic in info.topics)}"
         yield Finding(PROBLEM, f"{path}: {found}", "record the sensors' topics; docs/recordings.md has other formats")

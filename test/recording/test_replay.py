@@ -311,6 +311,13 @@ def test_the_command_prints_a_report(wave: Path, tmp_path: Path, command: Comman
     assert 0.0 < report["elapsed_s"] < 60.0
 
 
+def test_a_recording_without_skeletons_is_refused_with_the_options_for_it(tmp_path: Path, command: Command) -> None:
+    code, _, error = command("replay", BAG.with_name("cameras_turning"), "-o", tmp_path / "out")
+    assert code == 2 and "the option that takes them: --camera, --camera-rig, --depth or --marker-setup" in error
+    code, _, error = command("calibrate", BAG.with_name("cameras_turning"), "-o", tmp_path / "lab.yaml")
+    assert code == 2 and "no topic /<sensor>/skeleton" in error and "--camera" not in error
+
+
 def test_the_summary_of_a_replay_has_poses_and_known_angles(replayed_wave: Path, extended_wave: Path) -> None:
     lines = list(summary(replayed_wave))
     assert lines[0].startswith("kinect1: at x 0.00, y 0.00, z 0.00 m of world, looks 0 deg")
