@@ -17,6 +17,7 @@ BAND: Final = 1.959963984540054
 """Half width of the 95 % band of a normal distribution, in standard deviations."""
 WIDEST: Final = 60.0
 """Limit of a band's half width, degrees, also for infinite standard deviations."""
+_HALF_TURN: Final = 180.0
 _PREFERRED: Final = ("elbow_flexion", "shoulder_elevation", "shoulder_flexion", "trunk_flexion", "p_shoulder", "elbow")
 
 
@@ -37,6 +38,11 @@ class Curve:
     low: FloatArray
     high: FloatArray
     latest_stddev: float
+
+    def latest(self) -> str:
+        """The latest angle and half its band; ``?`` where that is half a turn or more, which leaves no angle out."""
+        reach = BAND * self.latest_stddev
+        return f"{self.values[-1]:.1f}\u00b0 \u00b1 " + (f"{reach:.1f}\u00b0" if reach < _HALF_TURN else "?")
 
 
 class AngleHistory:

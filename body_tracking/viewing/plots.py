@@ -9,7 +9,7 @@ import viser
 from viser import uplot
 
 from body_tracking.kinematics.labels import by_limb, label_of
-from body_tracking.viewing.curves import BAND, AngleHistory, first_choice
+from body_tracking.viewing.curves import AngleHistory, first_choice
 
 PLOTS: Final = 4
 """Number of plots."""
@@ -103,6 +103,4 @@ class _Plot:
         curve = history.curve(self._names.get(self._choice.value, ""), POINTS)
         if curve is not None:
             self._plot.data = (curve.times, curve.values, curve.low, curve.high)
-            now = f"{curve.values[-1]:.1f}\u00b0"
-            known = np.isfinite(curve.latest_stddev)
-            self._choice.label = f"{now} \u00b1 {BAND * curve.latest_stddev:.1f}\u00b0" if known else f"{now} \u00b1 ?"
+            self._choice.label = curve.latest()

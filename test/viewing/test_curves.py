@@ -64,6 +64,16 @@ def test_unobserved_angles_have_a_wide_band_and_no_invented_value() -> None:
     assert curve.latest_stddev == np.inf
     other = history.curve(NAMES[1], 200)
     assert other is not None and other.latest_stddev == pytest.approx(np.degrees(0.01))
+    assert curve.latest() == "17.2° ± ?"
+    assert other.latest() == "28.6° ± 1.1°"
+
+
+def test_a_band_that_spans_all_angles_is_not_given_as_a_number() -> None:
+    for stddev, text in ((1.5, "17.2° ± 168.4°"), (1.7, "17.2° ± ?")):
+        history = filled(10)
+        history.add(10 * STEP_NS, NAMES, np.array([0.3, 0.5]), np.array([stddev, 0.01]))
+        curve = history.curve(NAMES[0], 200)
+        assert curve is not None and curve.latest() == text
 
 
 # --- kept samples
