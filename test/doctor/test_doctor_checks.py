@@ -17,7 +17,7 @@ BAG = Path(__file__).resolve().parents[2] / "bags" / "tpose_wave"
 
 
 def worst(findings: Iterable[Finding]) -> tuple[str, str]:
-    """The worst level, and what was found of that level."""
+    """The worst level, and the findings of that level."""
     found = list(findings)
     assert all((each.level == OK) == (not each.remedy) and "\n" not in each.found for each in found)
     level = max((each.level for each in found), key=(OK, WARNING, PROBLEM).index)

@@ -22,7 +22,7 @@ SMALL = kinect_camera(2)
 
 
 class Painted(ArmScene):
-    """An arm of whose balls some are grey."""
+    """An arm with some grey balls."""
 
     def images(self, time: float, number: int) -> Any:
         image, depth = super().images(time, number)

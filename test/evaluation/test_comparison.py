@@ -52,7 +52,7 @@ def estimate(delay: float = 0.0, noise: float = 0.0, **changed: object) -> Recor
     stamps_ns = truth().stamps_ns[10:-1:2] + 7_000_000
     zero = int(truth().stamps_ns[0])
     positions = Curve(truth().seconds(zero), truth().positions).at((stamps_ns - zero) / NANOSECONDS - delay)
-    # errors of the joints of a bone are alike, as the deviations of angles take them to be
+    # errors of the joints of a bone are correlated, as the deviations of angles assume
     alike = np.linalg.cholesky(joint_correlation())
     positions = positions + noise * alike @ np.random.default_rng(4).standard_normal(positions.shape)
     covariances = np.broadcast_to(max(noise, 1e-3) ** 2 * np.eye(3), (*positions.shape, 3))

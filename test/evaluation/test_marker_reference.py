@@ -228,7 +228,7 @@ def test_errors_that_last_longer_than_half_of_the_recording_are_in_the_interval(
             parts.append(Differences(0.03, errors, np.zeros(300), np.full((300, 1, 1), 1e-6)))
         found = judge("angle", parts, mountings_known=False)
         assert found is not None
-        # what a mounting for the whole recording leaves
+        # the error that one mounting for the whole recording leaves
         true = np.hypot(noise, 0.5 * abs(means[0] - means[1]))
         inside.append(found.low <= true <= found.high if not found.too_poor else found.high >= true)
     assert np.mean(inside) > 0.9

@@ -244,7 +244,7 @@ def test_the_joint_centres_of_a_known_posture_are_found(
 
 @pytest.mark.parametrize(("bend", "found", "off"), [(0.0, 27.0, 64.0), (30.0, 37.0, 16.0), (90.0, 91.0, 3.0)])
 def test_a_straight_arm_in_a_t_pose_looks_bent(bend: float, found: float, off: float) -> None:
-    """Not ours to mend: the convention's own error, which the module's docstring states."""
+    """An error of the convention itself, which the module's docstring states."""
     shoulder, elbow = np.array([-0.03, 0.17, -0.02]), np.array([-0.03, 0.46, -0.02])
     forearm = np.sin(np.radians(bend)) * X + np.cos(np.radians(bend)) * Y  # flexion in the horizontal plane
     wrist = elbow + 0.25 * forearm
@@ -538,7 +538,7 @@ def vicon_centres(shared_data: Path, name: str) -> FloatArray:
 
 @pytest.mark.parametrize("name", FILES)
 def test_joint_centres_are_those_that_vicon_wrote(shared_data: Path, name: str) -> None:
-    # smoothing takes what noise is left: nothing where Vicon's software had smoothed before
+    # smoothing removes the remaining noise: none where Vicon's software has smoothed before
     for smoothing, metres in ((False, 1e-6), (True, 5e-4)):
         truth, theirs = of_vicon(shared_data, name, smoothing=smoothing), vicon_centres(shared_data, name)
         assert truth.missing == truth.gaps == truth.estimated == ()

@@ -21,7 +21,7 @@ SCENE = ArmScene()
 def trial(
     seed: int, delay: float = 0.0, noise: float = 1e-3, offset: FloatArray | None = None, lead: float = 0.3
 ) -> Trial:
-    """What a camera with white noise would measure; the balls of each image in any order."""
+    """Measurements of a camera with white noise; the balls of each image in any order."""
     rng = np.random.default_rng(seed)
     robot = np.arange(-0.5, SCENE.seconds + 1.5, 0.01)
     times = np.sort(rng.uniform(0.0, SCENE.seconds + lead, 300))

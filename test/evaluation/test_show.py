@@ -34,7 +34,7 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 @pytest.fixture(scope="module")
 def tracked_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wave as one sensor at its true place would track it, which has white noise only, with the truth."""
+    """The wave tracked by one sensor with its true pose and white noise only, with the truth."""
     noisy = replace(KinectErrors.none(), white=0.001)
     recording = simulate(Setup("two_handed_wave", seconds=9.0, standard=True, errors=noisy))
     sensor = recording.sensors[0]

@@ -37,7 +37,7 @@ def test_a_smooth_warp_is_recovered(offset: float, rate: float, bend: float) -> 
     at = warp(TIMES)
     inside = np.isfinite(at)
     assert inside.sum() > 30
-    # where little moves, little shows the time: so the error is weighed by the speed, in shares of the movement
+    # the slower the movement, the less it determines the time: the error is weighted by the speed
     error = np.abs(movement(at) - movement(true))[inside]
     # at the ends the warp is held by one side only: offset 0.5, rate 0.8125, bend -0.09375 errs by 0.064 there
     assert np.quantile(error, 0.95) < 0.05 and error.max() < 0.1

@@ -1,4 +1,4 @@
-"""What tests of the extended filter ask of its estimates."""
+"""Access to the extended filter's estimate, and comparison of two estimates, for its tests."""
 
 from __future__ import annotations
 

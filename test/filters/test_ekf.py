@@ -140,7 +140,7 @@ def test_joint_centre_offsets_are_in_the_published_covariance() -> None:
     root = np.linalg.cholesky(joint_correlation())
     rng = np.random.default_rng(5)
     stated = np.broadcast_to(np.diag([0.03**2] * 3), (N_JOINTS, 3, 3))
-    # of forearms and hands it is true to first order only
+    # for forearms and hands the covariance holds to first order only
     near = np.array([k for k in OBSERVED if not MODEL.coordinate_names[k].startswith(("forearm", "wrist"))])
     considered, ignored = [], []
     count = draws(5, 60)
@@ -168,7 +168,7 @@ def test_joint_centre_offsets_are_in_the_published_covariance() -> None:
 
 
 def test_sensors_that_contradict_each_other_do_not_start_it_anew_time_and_again() -> None:
-    """Four that are off by 4 cm each in their own way: no pose is right for all, and looking for one is of no use."""
+    """Four sensors with different constant errors of 4 cm: no pose fits them all, and a search for one is in vain."""
     rng = np.random.default_rng(3)
     truth = random_truth(3, 1.5)
     stated = np.broadcast_to(np.diag([0.03**2] * 3), (N_JOINTS, 3, 3))
@@ -179,7 +179,7 @@ def test_sensors_that_contradict_each_other_do_not_start_it_anew_time_and_again(
             stamp_ns = frame.stamp_ns + place * 8_000_000
             moved = replace(frame, stamp_ns=stamp_ns, positions=frame.positions + offset, covariances=stated)
             estimator.take(moved, name)
-    assert estimator.counters["restarts"] <= 1  # looked for every quarter of a second it was one in 0.4 s
+    assert estimator.counters["restarts"] <= 1  # with a search every quarter of a second: one in 0.4 s
 
 
 def test_its_uncertainty_is_true() -> None:
@@ -255,7 +255,7 @@ def test_lengths_come_from_many_poses_once_there_are_some() -> None:
         before = state.lengths
     assert 2 <= len(changes) <= 6 and np.diff(changes).min() > 0.9
     assert np.abs(known(estimator).lengths - truth.lengths).max() < 0.02
-    # pose and lengths are wrong together as the joint covariance says
+    # errors of pose and lengths agree with their joint covariance
     assert 0.4 < np.mean(normalised) / len(both) < 1.6, np.mean(normalised) / len(both)
 
 
@@ -423,14 +423,14 @@ def stalled(seed: int, held: int = 6) -> tuple[list[tuple[Skeleton, str]], int]:
 
 @pytest.mark.parametrize("seed", range(1, 1 + draws(1, 3)))
 def test_a_burst_of_late_frames_counts_as_each_alone_and_goes_back_once(seed: int) -> None:
-    """However often each of them is repeated before it is put in its place."""
+    """Also if each of them is repeated before it is inserted."""
     frames, in_time = stalled(seed)
     together, one_by_one, in_order = ExtendedKalmanFilter(), ExtendedKalmanFilter(), ExtendedKalmanFilter()
     for number, (skeleton, sensor) in enumerate(frames):
         assert together.take(skeleton, sensor) == one_by_one.take(skeleton, sensor)
         if number >= in_time:
             assert not together.take(skeleton, sensor)
-        asked = one_by_one.estimate  # has the frame's share in it
+        asked = one_by_one.estimate  # includes the frame
     assert asked is not None
     for skeleton, sensor in sorted(frames, key=lambda each: each[0].stamp_ns):
         in_order.take(skeleton, sensor)
@@ -595,7 +595,7 @@ def test_a_start_that_is_60_degrees_wrong_is_right_within_a_second(seed: int) ->
 
 
 def test_the_first_frame_is_met_although_the_pose_is_far_from_where_it_is_linearised() -> None:
-    """One linearisation would leave the forearm's points 12 mm off: what curves is of second order in the turn."""
+    """A single linearisation would leave the forearm's points 12 mm off, by the terms of second order in the turn."""
     elbow = MODEL.coordinate_names.index("elbow_flexion_right")
     turn = np.zeros(MODEL.nv)
     turn[elbow] = 0.8
@@ -613,7 +613,7 @@ def test_the_first_frame_is_met_although_the_pose_is_far_from_where_it_is_linear
 
 
 def test_an_arm_that_comes_back_elsewhere_is_found_within_two_frames() -> None:
-    """After a second unseen, in which it went on briskly: an update linearised where it was can end anywhere."""
+    """After a second of fast motion unseen: an update linearised at the old pose can end anywhere."""
     for seed in range(320, 320 + draws(1, 12)):
         truth = random_truth(seed, 2.3, tempo=1.6)
         for arm in ARMS.values():
@@ -721,7 +721,7 @@ def test_without_a_trunk_there_is_no_start() -> None:
 
 
 def test_of_a_person_who_stands_no_unobserved_angle_drifts_or_is_told() -> None:
-    """Unobserved angles stay where they are, and keep the deviation of the posture prior, which alone knows them.
+    """Unobserved angles stay where they are, and keep the deviation of the posture prior, which alone determines them.
 
     Points that are known exactly leave two directions, along which the prior decides. The filter applies it to its
     state and once more to its output, so the stated deviation is at least that of a prior that counts twice, less 5 %

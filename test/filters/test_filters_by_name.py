@@ -1,4 +1,4 @@
-"""Filters by their names: their parameters, and what all of them do with stamps; and when a prediction is due."""
+"""Filters by name: parameters, the handling of stamps, and the times at which predictions are due."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def assert_alike(one: Skeleton | None, other: Skeleton | None) -> None:
 
 
 ANEW = {"backward_jumps": (-50, "world"), "frame_changes": (2, "map"), "gaps": (50, "world"), "reset": (-50, "world")}
-"""Seconds by which the stamps after what is counted are later, and their frame of reference."""
+"""By counter: seconds by which the frames after such an event are later, and their frame of reference."""
 
 
 @pytest.mark.parametrize(

@@ -199,7 +199,7 @@ def without(*joints: Joint) -> np.ndarray:
 
 @pytest.mark.parametrize("hidden", [[Joint.WRIST_LEFT], list(Joint)], ids=["a wrist", "all"])
 def test_missing_joints_are_pure_prediction(hidden: list[Joint]) -> None:
-    """Of a body that moves as one: they go on with it, without a kink."""
+    """If the body moves as a whole, its hidden joints move with it, without a kink."""
     tracker = LinearKalmanFilter(CONSTANT_VELOCITY)
     velocity = np.array([0.6, -0.3, 0.1])
     last = run(tracker, np.stack([BODY + velocity * k / 30 for k in range(90)]))[-1]
@@ -219,7 +219,7 @@ def test_missing_joints_are_pure_prediction(hidden: list[Joint]) -> None:
 
 
 def test_a_hidden_hand_is_carried_by_the_arm() -> None:
-    """Its own movement fades, and whatever the wrist does, it does, too."""
+    """Its motion relative to the wrist fades, and it follows the wrist."""
     p = LinearKalmanParameters()
     tracker = LinearKalmanFilter(CONSTANT_VELOCITY, p)
     hand, tip, wrist = Joint.HAND_LEFT, Joint.HAND_TIP_LEFT, Joint.WRIST_LEFT
@@ -303,7 +303,7 @@ def test_after_a_jump_the_deviation_includes_it_and_fades(jump: float) -> None:
 
 
 def test_a_punch_is_followed() -> None:
-    """An elbow that is thrust forward at 45 m/s2 and stopped as hard; without adaptation it is left half a metre."""
+    """An elbow thrust forward at 45 m/s2 and stopped as hard; without adaptation the error reaches half a metre."""
     elbow = Joint.ELBOW_RIGHT
     times = np.arange(45) / 30.0
     path = np.repeat(BODY[None], len(times), axis=0)

@@ -47,18 +47,18 @@ PRONATION = [NAMES.index(f"forearm_pronation_{side}") for side in ("left", "righ
 FOREARMS = ("forearm_left", "forearm_right")
 HANDS = tuple(Joint[f"{part}_{side}"] for part in ("HAND", "HAND_TIP", "THUMB") for side in ("LEFT", "RIGHT"))
 BODY = 85
-"""Numbers of the state without any source."""
+"""Size of the state without sources."""
 PERFECT = EkfParameters(
     misalignment_stddev=1e-3,
     heading_stddev=1e-3,
     tissue_stddev=0.0,
 )
-"""For sources that do not err."""
+"""Parameters for sources without errors."""
 
 
 @dataclass(frozen=True)
 class Person:
-    """Somebody who moves, and what a camera sees of it."""
+    """A moving person, and a camera's skeletons."""
 
     body: RandomPerson
     motion: RandomMotion
@@ -171,7 +171,7 @@ def rms(errors: FloatArray) -> float:
 
 
 def learnt(estimator: ExtendedKalmanFilter, source: Source) -> tuple[FloatArray, FloatArray]:
-    """(4,) errors of what is known of misalignment and heading, radians, and (4, 4) their covariance."""
+    """(4,) errors of the estimated misalignment and heading, radians, and (4, 4) their covariance."""
     state = estimator._state
     assert state is not None
     number = state.sources.find(f"imu_{source.segment}")
@@ -281,17 +281,17 @@ def test_what_a_source_states_of_itself_is_what_is_known_of_it_at_first_and_late
     sources, covariance = Sources.none().with_new(first, p)
     aligned = p.misalignment_stddev**2 + 2e-3
     assert_allclose(covariance.diagonal()[:4], [aligned, aligned, aligned, 0.03])
-    # only a few degrees of it come and go
+    # only a few degrees of the error vary
     assert (np.diag(sources.slow_variance[0]) <= 2.0 * p.tissue_stddev**2 + 1e-12).all()
     assert sources.restated(0, replace(first, stamp_ns=1), p) is None
-    # a heading that drifts
+    # the stated variance of the heading grows: drift
     drifted = sources.restated(0, replace(first, covariance=np.diag([1e-3, 3e-3, 0.1])), p)
     assert drifted is not None
     known, left, new = drifted
     assert_allclose(left, 1.0)
     assert_allclose(new, [0.0, 0.0, 0.0, 0.07])
     assert known.restated(0, replace(first, covariance=np.diag([1e-3, 3e-3, 0.1])), p) is None
-    # one that was corrected: of what nothing else is known of, the variance is what is stated
+    # it shrinks: the source has corrected its heading; without other information the variance is the stated one
     known = known.moved(np.array([0.0, 0.0, 0.0, 0.2, 0.0, 0.0, 0.0]))
     corrected = known.restated(0, replace(first, covariance=np.diag([1e-3, 3e-3, 0.02])), p)
     assert corrected is not None
@@ -345,7 +345,7 @@ ALL_BUT_HANDS = ("pelvis", "upper_trunk", "head", "upper_arm_left", "forearm_lef
 
 
 def still(posture: dict[str, float], seconds: float, until: dict[str, float] | None = None) -> list[SegmentOrientation]:
-    """What seven sources that do not err, and do not know it, report of a person who does not move; until when each."""
+    """Seven exact sources, which state 0.2 rad, on a person who does not move; ``until`` ends some of them, seconds."""
     step = np.zeros(MODEL.nv)
     step[[NAMES.index(name) for name in posture]] = np.radians(list(posture.values()))
     rotations = MODEL.forward(MODEL.integrate(MODEL.neutral(), step), MODEL.default_lengths()).rotations
@@ -436,7 +436,7 @@ def test_a_camera_teaches_a_source_where_a_forearm_points_and_not_how_it_is_turn
     taught = np.zeros(3)
     for k in range(30):
         stamp_ns = START_NS + k * NANOSECONDS // 30
-        if k == 20:  # a Kinect v2 sees a hanging arm bent to where it is not
+        if k == 20:  # a Kinect v2 displaces the elbow of a hanging arm
             positions[Joint.ELBOW_RIGHT] += [0.05, -0.03, 0.0]
         before = said() if k >= 20 else None
         estimator.take(Skeleton(stamp_ns, "world", positions, tracked))
@@ -480,7 +480,7 @@ TURNED_ROUND = 0.035
 
 @pytest.mark.slow
 def test_filter_that_began_turned_round_recovers_in_most_cases() -> None:
-    """The share that stays turned round is no larger than the known one, which two people could not say."""
+    """The share that stays turned round is no larger than the known one; two people are too few to show that."""
     count = draws(20, 200)
     turned = 0
     for seed in range(count):
@@ -493,7 +493,7 @@ def test_filter_that_began_turned_round_recovers_in_most_cases() -> None:
 
 
 def test_a_doubt_about_the_sides_fades_with_time_and_not_with_frames() -> None:
-    """Or it would be forgotten the sooner the more cameras there are."""
+    """Otherwise it would fade faster with more cameras."""
     estimator, person = ExtendedKalmanFilter(), worn_person(3, 1.0)
     followed(estimator, person.skeletons, person)
     state = estimator._state
@@ -784,7 +784,7 @@ def test_a_source_that_is_silent_for_long_or_moves_to_another_segment_is_forgott
 
 
 def test_a_pose_is_found_from_orientations() -> None:
-    """But for how it is drawn to the middle of its ranges, and upright."""
+    """Except for the pull of the ranges' centres and of the upright posture."""
     person = worn_person(10, 1.0)
     posture = MODEL.forward(person.truth.q[0], person.body.lengths)
     measured = [

@@ -1,4 +1,4 @@
-"""What the node ``skeleton_filter`` does, without ROS."""
+"""The stage of the node ``skeleton_filter``: several people, and the order of frames."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def staged(
 ) -> Staged:
     """The stage after all events; topic and stamp of what it published; the skeletons.
 
-    With ``busy``, it looks at what has come once in so many seconds only, and takes that together.
+    With ``busy``, it takes all frames that have arrived together, once in so many seconds.
     """
     published: list[tuple[str, int]] = []
     skeletons: list[Skeleton] = []
@@ -91,7 +91,7 @@ def staged(
 
 @pytest.fixture(scope="module")
 def prompt(events: list[Event]) -> Staged:
-    """Of a stage that looks at each frame as it comes."""
+    """The output of a stage that takes each frame on arrival."""
     return staged(events)
 
 

@@ -152,7 +152,7 @@ def test_a_length_that_is_never_seen_is_the_other_sides_or_an_average_one() -> N
 
 @pytest.mark.parametrize("hidden", [[Joint.SPINE_BASE], [Joint.HIP_LEFT, Joint.SHOULDER_LEFT]])
 def test_nothing_starts_before_place_and_heading_are_seen(hidden: list[Joint]) -> None:
-    """As soon as the last frames show them, it does."""
+    """It starts as soon as the last frames show both."""
     tracker = SchlagenhaufKalmanFilter()
     seen = pose(np.zeros(26))
     seen[hidden] = np.nan

@@ -41,12 +41,12 @@ from walkers import TRACKED
 FRAME_NS = NANOSECONDS // 30
 LAG = 0.15
 LATER = 5
-"""Frames from one to the first that is later by LAG."""
+"""Number of frames from one to the first that is later by at least LAG."""
 BODY = np.random.default_rng(0).normal(size=(N_JOINTS, 3)) * 0.4 + [2.0, 0.0, 0.0]
 NOISE = 0.01
 """Metres per axis."""
 EXACT = LinearKalmanParameters(white_noise_share=1.0, adaptation=0.0, gate_probability=1.0 - 1e-12)
-"""Settings with which the linear filter is Kalman's."""
+"""Settings with which the linear filter is a plain Kalman filter."""
 
 
 def frame(stamp_ns: int, positions: FloatArray = BODY, **other: Any) -> Skeleton:

@@ -23,7 +23,7 @@ ELBOWS, ARMS = (
 RATE = 30.0
 SECONDS = draws(7, 16)
 HOLDING, MOVING = range(70, 88), range(150, round(SECONDS * RATE))
-"""Frames in which the pose is held and known, and in which the person is at it."""
+"""Frames in which the T-pose is held after it was learnt from, and in which the arms reach in many directions."""
 GAP = 1.5
 """Seconds: longer than a linear filter goes on for, shorter than the other one."""
 
@@ -36,7 +36,7 @@ def reaching() -> FloatArray:
 
 @cache
 def skeletons() -> tuple[Skeleton, ...]:
-    """The same as a camera sees it that takes elbows to be too low and wrists too high."""
+    """Skeletons of :func:`reaching` by a camera that sees elbows too low and wrists too high."""
     local = np.zeros((len(LEARNT), 3))
     for place, joint in enumerate(LEARNT):
         if joint in (Joint.ELBOW_LEFT, Joint.ELBOW_RIGHT):
@@ -44,7 +44,7 @@ def skeletons() -> tuple[Skeleton, ...]:
         elif joint in (Joint.WRIST_LEFT, Joint.WRIST_RIGHT):
             local[place] = [0.02, 0.0, 0.03]
     t_pose = reaching()[20]
-    # in the frames of the segments, of what is so in the T-pose
+    # offsets in the T-pose, converted to the frames of the segments
     axes = posed(t_pose, np.broadcast_to(np.eye(3), (len(LEARNT), 3, 3)).copy())
     local = np.einsum("jab,jb->ja", axes, local)
     rng = np.random.default_rng(0)
@@ -81,14 +81,14 @@ def run(
 
 @cache
 def taught(name: str) -> tuple[SkeletonFilter, FloatArray, FloatArray]:
-    """A filter that has seen all of it, the errors of the elbows and their stated deviations."""
+    """A filter after all frames, the errors of the elbows and their stated deviations, degrees."""
     tested = make_filter(name)
     return tested, *run(tested)
 
 
 @cache
 def untaught(name: str) -> FloatArray:
-    """Errors of the elbows without what a T-pose says."""
+    """Errors of the elbows without the correction by the T-pose, degrees."""
     tested = make_filter(name, t_pose=False)
     errors, _ = run(tested)
     assert tested.counters["t_poses"] == 0

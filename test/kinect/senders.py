@@ -1,4 +1,4 @@
-"""A sender of frames without a socket, for tests of who receives them."""
+"""A sender of frames without a socket, for tests of the receiver."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Partner:
         self.sent: list[bytes] = []
 
     def frame(self, now_ns: int, bodies: Sequence[Body] = (body(),), sequence: int | None = None) -> bytes:
-        """A packet of what was captured just now."""
+        """A packet with a frame captured now."""
         self.sequence = self.sequence + 1 if sequence is None else sequence
         sent_ns = now_ns + self.ahead_ns
         header = Header(protocol.FRAME, "kinect1", self.session, self.sequence, sent_ns)
@@ -62,14 +62,14 @@ class Partner:
         return packet
 
     def give(self, packet: bytes, now_ns: int) -> ReceivedFrame | None:
-        """Hand a packet that is sent now to the receiver, and answer what that asks."""
+        """Hand a packet that is sent now to the receiver, and answer its requests."""
         arrival_ns = now_ns + 1_000_000
         result = self.receiver.take(packet, self.address, arrival_ns, arrival_ns)
         self.answer(arrival_ns)
         return result
 
     def stream(self, begin_ns: int, count: int) -> list[ReceivedFrame | None]:
-        """So many frames, 30 a second; what the receiver makes of each."""
+        """Send ``count`` frames at 30 Hz; returns the receiver's result for each."""
         return [self.give(self.frame(begin_ns + k * FRAME_NS), begin_ns + k * FRAME_NS) for k in range(count)]
 
     def answer(self, now_ns: int) -> None:

@@ -1,4 +1,4 @@
-"""The packets of skeleton streaming: what goes in comes out, and nothing else is taken for a packet."""
+"""The packets of skeleton streaming: reading inverts packing, and everything else is refused."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ UINT64 = st.integers(0, 2**64 - 1)
 
 @st.composite
 def frames(draw: st.DrawFn) -> Frame:
-    """Any that can be: few numbers are drawn, the many come of a seed."""
+    """Any valid frame: a few numbers are drawn, all others come from a seed."""
     numbers = np.random.default_rng(draw(st.integers(0, 2**32)))
     strange = draw(st.sampled_from([0.0, -0.0, math.nan, math.inf, -math.inf, 3e38, 1e-40]))
     bodies = []

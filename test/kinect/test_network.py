@@ -90,7 +90,7 @@ def test_a_stream_that_stops_is_named_with_its_time_and_goes_on_by_itself() -> N
     later = now + 30 * NANOSECONDS
     result = partner.give(partner.frame(later), later)
     assert result is not None
-    # thirty seconds without round trips: the clocks are where they were foretold to be
+    # thirty seconds without round trips: the prediction of the clocks still holds
     assert abs(result.stamp_ns - later) < 100_000
     assert receiver.counters["sessions"] == 1
 

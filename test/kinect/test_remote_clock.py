@@ -62,7 +62,7 @@ def test_with_equal_delays_the_offset_is_exact_and_drift_is_followed() -> None:
         ask(trips, k * NANOSECONDS // 4, 300 * MS, 80e-6, 2 * MS, 2 * MS)
     assert trips.drift == pytest.approx(80e-6, abs=1e-6)
     local = 400 * NANOSECONDS // 4
-    # and foretold while nothing comes: half a minute later
+    # and predicted without round trips: half a minute later
     for later in (0, 30 * NANOSECONDS):
         now = local + later
         error = trips.offset_ns(round(now - true_offset(now, 300 * MS, 80e-6))) - true_offset(now, 300 * MS, 80e-6)

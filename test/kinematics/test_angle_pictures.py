@@ -25,7 +25,7 @@ def pictures() -> Any:
 
 
 def check(pictures: Any, convention: str, name: str) -> None:
-    """What is drawn of an angle grows by what was asked for; of other joints nothing moves."""
+    """The drawn angle grows by the requested amount, and no other joint moves."""
     before = pictures.start(name)
     after = pictures.moved(before, name, convention, BY)
     change = pictures.angles(after, convention) - pictures.angles(before, convention)

@@ -443,7 +443,7 @@ def test_noise_does_not_spin_an_arm_at_a_singular_pose(name: str) -> None:
 
 
 def test_an_unobserved_angle_has_the_deviation_of_its_prior() -> None:
-    """What is known of it is handed out; infinity is left to what has no estimate at all."""
+    """The prior's deviation is published; an infinite one means that there is no estimate at all."""
     prior = PosturePrior(MODEL, RANGES)
     covariance = np.diag(np.append(np.zeros(6), prior.stddev**2).tolist() + [0.0] * NV)
     angles = angles_of(estimate(poses(1)[0], covariance=covariance), MODEL, "model")

@@ -22,7 +22,7 @@ MILLIMETRE = 1e-3
 OF_ARMS_AND_TRUNK = [joint for joint in Joint if joint.name.split("_")[0] in ("SPINE", "SHOULDER", "ELBOW", "WRIST")]
 BONES = [bone for bone in SKELETON_BONES if set(bone) <= {*OF_ARMS_AND_TRUNK, Joint.HAND_LEFT, Joint.HAND_RIGHT}]
 EXACT = np.full(len(MODEL.joints), 1e-4)
-"""Metres: a noise that leaves the ranges of motion nothing to say."""
+"""Metres: so little noise that the ranges of motion have no influence."""
 
 
 def people(count: int, seed: int) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -112,7 +112,7 @@ def test_starts_that_are_somewhat_wrong_lead_to_the_same_fit() -> None:
     ],
 )
 def test_missing_points_keep_what_is_seen_right(missing: tuple[Joint, ...], unknown: tuple[str, ...]) -> None:
-    """And of an angle that no seen point depends on, only what is known of it before is known."""
+    """An angle on which no seen point depends keeps the deviation of its prior."""
     _, lengths, points = people(draws(3, 30), 4)
     gone = of(*missing)
     for length, point in zip(lengths, points, strict=True):

@@ -1,4 +1,4 @@
-"""Angles from positions: known poses, invariances, derivatives, and a standard deviation that is meant."""
+"""Angles from positions: known poses, invariances, derivatives, and consistent standard deviations."""
 
 from __future__ import annotations
 
