@@ -1,4 +1,4 @@
-"""Angles of chains: as exact as the bars ask, as exact as stated, continuous, and NaN where nobody sees."""
+"""Angles of chains: as exact as required and as stated, continuous, and NaN where they are not observed."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def test_all_angles_of_an_arm_are_as_exact_as_stated_and_continuous() -> None:
 
 
 def test_the_whole_is_more_exact_than_the_difference_of_orientations() -> None:
-    """Positions say as much of an angle as orientations do: the point of one fit (Gaschler eq. 5.15 uses both)."""
+    """Positions carry as much information on an angle as orientations, so one fit uses both (Gaschler eq. 5.15)."""
     rng, tree = arm(40, ARM[1:2])
     posture = random_posture(rng, tree, 400)
     frames = measured(rng, tree, posture)
@@ -138,7 +138,7 @@ def test_a_target_that_is_not_seen_takes_its_angles_only() -> None:
         assert np.isnan(without_hand.angles[4:]).all() and np.isinf(without_hand.stddev[4:]).all()
         assert np.isfinite(without_hand.angles[:4]).all() and np.isnan(without_hand.gaps[2])
         assert (np.abs(without_hand.angles[:4] - whole.angles[:4]) < 6.0 * without_hand.stddev[:4] + 1e-4).all()
-        # through the forearm's joints the hand and the upper arm still tell of both
+        # hand and upper arm still determine both joints of the forearm
         without_forearm = estimator.estimate([pose for pose in frame if pose.name != "forearm"])
         assert (np.abs(without_forearm.angles[3:] - whole.angles[3:]) < 6.0 * without_forearm.stddev[3:]).all()
         assert (without_forearm.stddev[3:] > whole.stddev[3:]).all()
@@ -160,7 +160,7 @@ def test_a_hinge_turns_on_past_half_a_turn() -> None:
 
 @pytest.mark.slow
 def test_the_calibration_of_the_cameras_is_in_the_deviation() -> None:
-    """Errors that all poses share by a few parameters; the stated deviations are theirs."""
+    """The errors of all poses depend on a few common parameters; the stated deviations include these errors."""
     rng, tree = arm(70)
     posture = random_posture(rng, tree, 1)
     (frame,) = measured(rng, tree, posture, scale=1e-3)
@@ -196,7 +196,7 @@ def test_the_calibration_of_the_cameras_is_in_the_deviation() -> None:
 
 @pytest.mark.slow
 def test_the_chain_is_in_the_deviation() -> None:
-    """Chains drawn from a covariance give angles that differ by what is stated."""
+    """Angles by chains that are drawn from a covariance differ as stated."""
     rng, tree = arm(80, ARM[:2])
     frames = measured(rng, tree, random_posture(rng, tree, 200, motion=20.0))
     description = [JointDescription(joint.name, joint.parent, joint.child, joint.kind) for joint in tree.joints]
@@ -248,7 +248,7 @@ def test_places_follow_from_turns() -> None:
 
 
 def test_a_root_that_is_not_seen_takes_the_angles_of_its_joints_only() -> None:
-    """Where it is, and how its joints are turned, are not determined then; all others are, however small the noise."""
+    """The root's pose and the angles of its joints are then undetermined; all others are known, at any noise."""
     for seed, scale in ((50, 1.0), (51, 0.1), (52, 0.01)):
         rng, tree = arm(seed)
         whole, without = AngleEstimator(known(tree)), AngleEstimator(known(tree))

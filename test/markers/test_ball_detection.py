@@ -1,4 +1,4 @@
-"""Balls are found where they are, and as surely as is said."""
+"""Balls are found at their true places, with errors as stated."""
 
 from __future__ import annotations
 

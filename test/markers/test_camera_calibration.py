@@ -122,7 +122,7 @@ def test_a_wrong_board_is_named_and_left_out(shared_data: Path, kind: str) -> No
 def test_three_cameras_tell_whose_board_is_wrong() -> None:
     truth, rng = rig(3), np.random.default_rng(0)
     corners = seen_boards(truth, rng)
-    # of an instant that all see
+    # a view that all cameras see
     view = next(view for view in range(13) if len(np.unique(corners.cameras[corners.views == view])) == 3)
     mine = np.flatnonzero((corners.views == view) & (corners.cameras == 1))
     pixels = np.array(corners.pixels)
@@ -132,7 +132,7 @@ def test_three_cameras_tell_whose_board_is_wrong() -> None:
 
 
 def errors(truth: Rig, made: Rig) -> FloatArray:
-    """(p,) what is to be added to the parameters of a calibration."""
+    """(p,) corrections that turn a calibration's parameters into the true ones."""
     parts = []
     for index, (there, here) in enumerate(zip(truth.cameras, made.cameras, strict=True)):
         turn = so3.rotation_vectors(truth.rotations[index] @ made.rotations[index].T)
@@ -198,7 +198,7 @@ def test_four_real_cameras_fit_a_charuco_board_better_than_in_the_calibration_th
     seen = seen.where(np.bincount(key)[key] > 1)
     edges = Lengths(Chessboard(3, 4, 0.054).edges(), np.full(17, 0.054), 5e-4)
     mine = adjust_points(placed, intersect(placed, seen, 12), seen, edges, bundle.free_parameters(placed, None), 0.5)
-    # their cameras as they are, with points of its own (one focal length, that moves by its last digits, is free)
+    # their cameras fixed, with points of our own (one focal length is free, and moves by its last digits)
     free = np.arange(60) == 0
     other = adjust_points(theirs, intersect(theirs, seen, 12), seen, edges, free, 0.5)
     print(f"RMS {mine.rms():.3f} px, of caliscope's cameras {other.rms():.3f}")

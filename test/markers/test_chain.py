@@ -90,7 +90,7 @@ def calibrated(frame: list[TargetPose]) -> dict[str, FloatArray]:
 
 
 def wrong(frames: list[list[TargetPose]], step: FloatArray) -> list[list[TargetPose]]:
-    """The poses as cameras measure them whose calibration is wrong by a step."""
+    """The poses by cameras whose calibration is wrong by a step."""
     result = []
     for frame in frames:
         steps = {name: sensitivity @ step for name, sensitivity in calibrated(frame).items()}
@@ -124,7 +124,7 @@ def test_what_the_calibration_of_the_cameras_does_to_a_chain_and_to_its_angles_i
     other = fit_chain(wrong(frames, step), DESCRIPTION).chain
     apart = np.concatenate([a.difference(b) for a, b in zip(other.joints, chain.joints, strict=True)])
     assert np.abs(apart - chain.sensitivity @ step).max() < 0.03 * np.abs(apart).max()
-    # the angles of the wrong chain by the wrong cameras are off by what is stated
+    # the angles of the wrong chain by the wrong cameras err as stated
     right, off = AngleEstimator(chain), AngleEstimator(other)
     for frame, (shifted,) in ((frame, wrong([frame], step)) for frame in frames[:40]):
         stated = right.estimate(frame, calibrated(frame), np.diag([0.0, 0.0, step[2] ** 2]))

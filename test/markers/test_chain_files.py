@@ -1,4 +1,4 @@
-"""Chains as files: what is written is read again, what is wrong is named; URDF moves as the chain does."""
+"""Chains as files: reading inverts writing, errors are named; URDF moves as the chain does."""
 
 from __future__ import annotations
 

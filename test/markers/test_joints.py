@@ -1,4 +1,4 @@
-"""Joints from recordings of two targets: errors as stated, and what a recording cannot say is named."""
+"""Joints from recordings of two targets: errors as stated, and undetermined parameters are named."""
 
 from __future__ import annotations
 

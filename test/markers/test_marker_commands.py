@@ -1,4 +1,4 @@
-"""``body_tracking markers`` from recordings of points to a setup, and what it refuses."""
+"""``body_tracking markers`` from recordings of points to a setup, and refused input."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_a_target_is_measured_from_a_recording(turned: Path, capsys: pytest.Capt
     assert (found.name, report["name"]) == ("hand", "hand")
     assert np.abs(distances(found.points) - distances(TARGET_POINTS)).max() < 2e-4
     assert report["views"] > 50 and report["stddev_mm"] < 0.1
-    # the same again takes its place; another of the same shape is refused
+    # the same target again replaces it; another of the same shape is refused
     assert cli.main(["markers", *words]) == 0
     assert cli.main(["markers", *[word if word != "hand" else "twin" for word in words]]) == 2
     assert [each.name for each in load_targets(turned / setup.TARGETS)] == ["hand"]
@@ -92,7 +92,7 @@ def test_a_wand_calibrates_three_cameras(waved: Path, tmp_path: Path, capsys: py
     report = json.loads(capsys.readouterr().out)
     truth, found = rig(3), load_rig(tmp_path / "lab" / setup.RIG)
     assert [camera.frame_id for camera in found.cameras] == list(report["cameras"]) == ["a", "b", "c"]
-    # 0.05 px at 1.2 m are 0.07 mm across a ray; of 60 places some millimetres along it are left
+    # 0.05 px at 1.2 m are 0.07 mm across a ray; after 60 places an error of some millimetres along it remains
     np.testing.assert_allclose(found.translations, truth.translations, atol=3e-3)
     for index, each in enumerate(report["cameras"].values()):
         expected = -1e3 * truth.rotations[index].T @ truth.translations[index]

@@ -1,4 +1,4 @@
-"""Cameras that were moved, are out of step or send what is no image: the stages name them, count them and go on."""
+"""Cameras that were moved, are out of step or send invalid images: the stages name them, count them and go on."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Watched:
         self.arm, self.frame = Arm(speed, self.rng), 0
 
     def run(self, frames: int, truth: Rig, late: tuple[float, ...] = (0.0, 0.0, 0.0)) -> str:
-        """What the diagnostics say after so many frames of a rig; each camera is late by so much."""
+        """Text of the diagnostics after ``frames`` frames of a rig; ``late`` is each camera's delay, seconds."""
         for _ in range(frames):
             stamp_ns = START_NS + round(self.frame / RATE * NANOSECONDS)
             points = [self.arm.at(self.frame / RATE - delay) for delay in late]
@@ -64,7 +64,7 @@ class Watched:
 
 
 def turn(rng: np.random.Generator) -> FloatArray:
-    """By 0.2 degrees, about any axis."""
+    """A rotation vector of 0.2 degrees about a random axis."""
     axis = rng.normal(size=3)
     return np.asarray(np.radians(0.2) * axis / np.linalg.norm(axis))
 
@@ -76,7 +76,7 @@ def test_a_camera_turned_in_mid_run_is_named_within_a_second(tmp_path: Path, see
     assert watched.run(RATE, turned(rig(3), 1, turn(watched.rng))).startswith("moved camera: b")
     assert [event.startswith("moved camera: b") for event in watched.stage.events] == [True]
     assert watched.stage.counters["moved camera found"] >= 1
-    # a jump of time forgets it, and put right it is told no more
+    # a jump of time forgets it, and once put right it is not reported any more
     watched.stage.reset(setup.balls_topic("a"))
     assert watched.run(RATE // 2, rig(3)) == ""
 
@@ -120,7 +120,7 @@ def test_stamps_out_of_step_are_named_and_the_right_pairs_still_made(tmp_path: P
             level, said, _ = watched.stage.state(0)
             assert level == 1 and said.startswith("b lacks in") and "6.7 ms after those of a" in said
     assert watched.stage.state(0)[1] == ""
-    # of the first 40 the other two cameras alone make points, with some that are none
+    # in the first 40 frames the other two cameras alone make points, some of them spurious
     assert min(len(output.payload.positions) for output in found) >= 15 and len(found) >= 58
 
 
@@ -155,7 +155,7 @@ def message(pixels: NDArray[Any], encoding: str = "") -> Any:
 
 
 def seen(folder: Path, *messages: Any) -> tuple[list[ImageBalls], DetectorStage, int]:
-    """What the detector makes of images of the left camera, the detector, and how many it refused."""
+    """Balls in images of the left camera, the detector's stage, and the number of refused images."""
     save_rig(stereo_rig(), folder / setup.RIG)
     stage = DetectorStage(check_all(DetectorStage.PARAMETERS, {"setup": str(folder)}))
     found: list[ImageBalls] = []
@@ -188,7 +188,7 @@ def test_images_that_show_no_balls_are_told_and_survived(
     assert not counted or stage.counters[counted] == 1
     assert said in stage.state(0)[1] and bool(stage.state(0)[0]) == bool(said)
     assert stage.counters["images without balls"] == (counted != "" and not refused)
-    # the next one is seen as if nothing had been
+    # the next image is handled as usual
     again, stage, _ = seen(tmp_path, bad, message(spots(np.uint16)))
     assert len(again[-1].pixels) == 3 and stage.state(0)[0] == 0
 

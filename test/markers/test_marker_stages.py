@@ -39,7 +39,7 @@ def stamp_ns(scene: MarkerScene, index: int) -> int:
 
 
 def true_poses(scene: MarkerScene, every: int) -> list[list[TargetPose]]:
-    """With 0.1 mm and 0.1 degrees of noise."""
+    """True poses with 0.1 mm and 0.1 degrees of noise."""
     rng, spread = np.random.default_rng(0), np.repeat([1e-4, 2e-3], 3)
     frames = []
     for index in range(0, len(scene.times), every):
@@ -141,13 +141,13 @@ def test_angles_follow_the_truth(scene: MarkerScene, published: dict[str, list[b
     rows = [stamps[each.stamp_ns] for each in found]
     angles = np.array([each.position[elbow] for each in found])
     truth = scene.elbow[rows]
-    # which axis points where is the chain's choice: the sign of an angle, and where it is zero
+    # the directions of the axes are the chain's choice, hence the sign and the zero of an angle
     for column in range(2):
         away = min(
             (np.degrees(sign * angles[:, column] - truth[:, column]) for sign in (1.0, -1.0)),
             key=lambda each: float(np.nanstd(each)),
         )
         assert np.nanstd(away) < 0.3
-    # the zero of the pronation, of which there was little when the chain was fitted, is known to a degree
+    # the chain was fitted with little pronation, so the zero of this angle is known to a degree
     deviations = np.degrees([each.position_stddev[elbow] for each in found])[np.isfinite(angles)]
     assert ((deviations > 0.05) & (deviations < 2.0)).all()

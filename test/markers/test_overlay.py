@@ -1,4 +1,4 @@
-"""What is drawn of markers: each ball by its own target, and the chain where its joints are."""
+"""The overlay of markers: each ball in its target's colour, and the chain at its joints."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_the_chain_is_drawn_through_its_joints(scene: MarkerScene) -> None:
     poses, chain = scene.poses(0, 5), scene.chain
     centres, lines = chain_places(chain, poses)
     assert centres.shape == (2, 3) and lines.shape == (4, 2, 3)
-    # of a chain that fits exactly, either target of a joint says where it is
+    # in a chain that fits exactly, either target of a joint gives its place
     for seen in (poses[:2], poses[1:], poses[::2]):
         some, _ = chain_places(chain, seen)
         assert all(np.linalg.norm(centres - each, axis=1).min() < 1e-6 for each in some)

@@ -103,7 +103,7 @@ def test_expected_markers_stand_in_for_measured_ones_with_a_warning(tmp_path: Pa
     ],
 )
 def test_a_damaged_export_is_refused_by_its_line(tmp_path: Path, old: str, new: str, said: str | None) -> None:
-    """Or read, where the damage is in what is not needed (None): the word Type, a rotation."""
+    """It is read if the damaged part is not needed (None): the word Type, a rotation."""
     path = tmp_path / "take.csv"
     assert old in motive(moving())
     path.write_text(motive(moving()).replace(old, new))

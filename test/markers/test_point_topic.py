@@ -31,7 +31,7 @@ NAN = float("nan")
 def through(
     kind: str, type_name: str, *messages: Any, noise: float = 1e-3
 ) -> tuple[list[Points], PointTopicStage, int]:
-    """What the stage makes of messages, the stage, and how many of them it could not read."""
+    """The stage's outputs for messages, the stage, and the number of messages that it could not read."""
     stage = PointTopicStage(check_all(PointTopicStage.PARAMETERS, {"topic": TOPIC, "message": kind, "noise": noise}))
     found: list[Points] = []
     runner = OfflineRunner([stage], BAG_WIRE, lambda topic, cdr, at: found.append(SpacePoints().decode(cdr, BAG_WIRE)))

@@ -1,6 +1,6 @@
 """Real points without labels: a walking person's targets (Motive), and a racer's (Optotrak).
 
-The labels are the truth, and say which points of one frame are a target; nothing else uses them.
+The labels are the truth, and pick the points of a target in one frame; nothing else uses them.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def read(path: Path) -> Recording:
 
 
 def calibrated(recording: Recording, name: str, every: int) -> Target:
-    """From every so many frames without labels, after its balls were picked in the first that has all."""
+    """A target from every ``every``-th frame without labels; its balls were picked in the first frame with all."""
     columns, rng = recording.columns(name), np.random.default_rng(0)
     complete = np.flatnonzero(np.isfinite(recording.points[:, columns]).all(axis=(1, 2)))
     frames = [

@@ -1,4 +1,4 @@
-"""A turned camera and cameras out of step are told apart, and neither is told of a rig that is well."""
+"""A turned camera and cameras out of step are distinguished, and neither is reported of a rig in order."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_of_three_cameras_the_turned_one_is_named_within_a_second(speed: float) 
 @pytest.mark.slow
 @pytest.mark.parametrize("speed", some([1.0, 0.0]))
 def test_of_two_cameras_a_turned_one_is_among_the_named(speed: float) -> None:
-    # turns about the line that joins them look alike, turns in the epipolar planes hardly show
+    # turns about the baseline look alike in both cameras, turns in the epipolar planes are hardly observable
     result = outcomes(Fault.MOVED_CAMERA, 2, speed, turn=np.radians(0.2))
     assert result["wrong"] <= 0.05 * result.total() and result["none"] <= 0.4 * result.total()
 

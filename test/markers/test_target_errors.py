@@ -1,4 +1,4 @@
-"""What targets are wrong by shifts the joints that are fitted to their poses, and is in what is stated of these."""
+"""Errors of targets displace the joints that are fitted to their poses, and are in the joints' covariances."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from body_tracking.simulation.marker_scene import make_targets, stereo_rig
 
 
 def test_the_errors_of_targets_are_in_the_deviations_of_joints() -> None:
-    """Targets that are wrong by draws of their covariance, poses without other errors: joints are wrong as stated."""
+    """Targets with errors drawn from their covariance, exact poses otherwise: errors of joints are as stated."""
     rig, rng, ratios = stereo_rig(), np.random.default_rng(4), []
     bodies = make_targets()[:2]
     tree = tree_of([random_joint(rng, JointKind.BALL, "joint", bodies[0].name, bodies[1].name)])

@@ -52,11 +52,11 @@ def test_errors_of_poses_are_within_their_stated_deviations(count: int) -> None:
 
 
 LENS = np.array([1.0, 1.0, 1.0, 1.0, 4e-3, 2e-2])
-"""Standard deviations of fx, fy, cx, cy and the radial distortion, as of a calibration by few boards."""
+"""Standard deviations of fx, fy, cx, cy and the radial distortion: those of a calibration by few boards."""
 
 
 def with_wrong_lenses(truth: Rig, rng: np.random.Generator) -> Rig:
-    """The rig with lenses that are as wrong as its covariance says."""
+    """The rig with errors of its lenses drawn from its covariance."""
     size = len(truth.cameras)
     error = np.zeros((size, 15))
     error[:, :6] = LENS * rng.normal(size=(size, 6))
@@ -74,9 +74,9 @@ def test_errors_of_the_lenses_are_in_the_deviations_of_the_poses() -> None:
         error = np.concatenate([turn, (truth.translations - made.rig.translations)[1:]], axis=1)
         deviation = np.sqrt(np.diag(made.rig.covariance)).reshape(4, 15)
         standard.append(error / deviation[1:, 9:])
-        # the wand tells more of the lenses than the boards did
+        # the wand adds information on the lenses to that of the boards
         assert (deviation[:, :4] < LENS[:4]).all()
-    # 1 is expected; lenses that are held where they are give 10
+    # 1 is expected; with fixed lenses it would be 10
     assert np.sqrt(np.mean(np.square(standard))) < 2.0
 
 

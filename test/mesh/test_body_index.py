@@ -1,4 +1,4 @@
-"""Body-index images: which depth image each belongs to, which body is the person, and what they are worth."""
+"""Body-index images: pairing with depth images, choice of the person's body, and their effect on errors."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_images_of_one_stamp_are_paired_in_either_order(pairs: IndexPairs, count
             found.append(pairs.next(stamp_ns + 5 * MS))
     given = [pair for pair in found if pair is not None]
     assert [pair.stamp_ns for pair in given] == [33 * MS * number for number in range(1, 6)]
-    # before the first one nobody knows that there are any
+    # before the first body-index image, none is expected
     assert [pair.bodies is not None for pair in given] == [first == "index", True, True, True, True]
     assert counted["images with a body index"] == 4 + (first == "index") and not pairs.problem
 
@@ -130,12 +130,12 @@ def test_a_missing_body_index_image_is_waited_for_no_longer_than_50_ms(
     # too late
     pairs.add_index(33 * MS, INDEX)
     assert counted["body-index images that came too late"] == 1
-    # one that was lost: the next one says so at once
+    # a lost one: the next body-index image releases the depth image at once
     pairs.add_depth(66 * MS, DEPTH, 100 * MS)
     assert pairs.next(100 * MS) is None
     pairs.add_index(99 * MS, INDEX)
     assert pairs.next(100 * MS) is not None
-    # a sensor that sends none any more
+    # the sensor stops sending body-index images
     pairs.add_depth(2000 * MS, DEPTH, 2000 * MS)
     assert pairs.next(2000 * MS) is not None
     # a jump back of time
@@ -275,7 +275,7 @@ def test_a_bag_with_body_index_images_is_replayed_with_them(tmp_path: Path) -> N
         for number in range(COUNT):
             stamp, (depth, index) = STAMPS[number], two_people(number, 0.42, 2.3)
             millimetres = np.round(1e3 * depth).astype(np.uint16)
-            # of the other one nothing is known; the first image did not wait for it
+            # no body-index image of the other person; the first depth image did not wait for one
             index[index == OTHER] = NO_BODY
             bag.write(IMAGES, DepthImage().encode((stamp, "camera", millimetres), BAG_WIRE), stamp)
             bag.write(BODIES, BodyIndex().encode((stamp, "camera", index), BAG_WIRE), stamp + MS)

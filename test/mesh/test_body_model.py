@@ -208,7 +208,7 @@ def test_smpl_files_load_from_npz_and_pickle_alike(
     for name in ("vertices", "joints", "vertex_shapes", "pose_shapes", "weights", "joint_shapes"):
         np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
     pose = random_pose(ours, np.random.default_rng(1))
-    # eq. 3 of Loper et al., written out with dense weights
+    # eq. 3 of Loper et al., with dense weights
     body = ours.body(np.ones(10))
     posed = body.posed(pose)
     dense = np.zeros((len(ours.vertices), joints))
@@ -221,7 +221,7 @@ def test_smpl_files_load_from_npz_and_pickle_alike(
 
 
 class ChumpyArray:
-    """As chumpy's arrays are pickled: the class's name and a dictionary with the numbers under ``x``."""
+    """Pickled like chumpy's arrays: the class's name and a dictionary with the numbers under ``x``."""
 
     def __init__(self, x: Any) -> None:
         self.x = x

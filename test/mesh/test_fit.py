@@ -239,7 +239,7 @@ def test_matches_are_the_nearest_places_of_the_surface_that_faces_the_camera(fit
     )
     np.testing.assert_allclose(found.shares.sum(axis=1), 1.0)
     distances = np.linalg.norm(found.places - on[kept], axis=1)
-    # the face of a point is one around its nearest vertex, but for long thin triangles
+    # the nearest face is one around the nearest vertex, except with long thin triangles
     assert np.mean(distances < 1e-6) > 0.85
     assert np.percentile(distances, 99) < 0.03
     assert np.median(found.agreements) > 0.999
@@ -298,7 +298,7 @@ def test_inertial_sensor_holds_a_hidden_forearm(fitter: MeshFitter, camera: Dept
     observation = seen(camera, fitter, truth, rng)
     posed = fitter.body.posed(truth)
     elbow = fitter.body.model.index("left_elbow")
-    # a box before the forearm: nothing of it is seen, and what is there is nearer
+    # a box before the forearm hides it, and is nearer
     pixels = CAMERA.project(posed.placed[[elbow, fitter.body.model.index("left_wrist")]]).astype(int)
     (left, top), (right, bottom) = pixels.min(axis=0) - 22, pixels.max(axis=0) + 22
     depth, mask = observation.depth.copy(), observation.mask.copy()

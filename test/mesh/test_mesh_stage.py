@@ -224,9 +224,9 @@ def test_an_orientation_comes_to_the_fit_in_the_cameras_frame_at_the_images_time
     assert names[found.joint] == "left_elbow" and not counters
     expected = CAMERA_POSE.rotation.T @ so3.quat_to_matrix(true)
     np.testing.assert_allclose(found.rotation, expected, atol=1e-9)
-    # 0.6 deg of the sensor, and what the frames of person and mesh differ by
+    # 0.6 deg of the sensor, and the difference between the frames of person and mesh
     assert (np.radians(0.6) < found.stddev).all() and (found.stddev < np.radians(10.0)).all()
-    # 60 ms after the newest one there is none
+    # 60 ms after the newest orientation it is not used any more
     assert worn.seen_from(placement, at_ns - 5 * NANOSECONDS + 90_000_001, names, counters) == []
     assert counters == {"images without an orientation of forearm_left": 1}
 

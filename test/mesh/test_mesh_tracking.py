@@ -1,4 +1,4 @@
-"""A person is tracked through depth images, and the loss of them is seen."""
+"""A person is tracked through depth images, and the loss of the person is detected."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def _prepared() -> None:
 
 @pytest.fixture
 def tracker() -> MeshTracker:
-    """Of a person of whom nothing is known."""
+    """A tracker of an unknown person."""
     body = body_model.load().body()
     return MeshTracker(DepthCamera(recording().camera), body, np.eye(len(body.shape)))
 

@@ -88,7 +88,7 @@ def sample(ms: float) -> bytes:
 
 
 def ray_table() -> np.ndarray:
-    """As the SDK's, of its mirrored image: x to the sensor's left, y up."""
+    """The SDK's table of rays for its mirrored image: x to the sensor's left, y up."""
     fx, fy, cx, cy, second, fourth, sixth = INTRINSICS
     matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     camera = Camera("sdk", WIDTH, HEIGHT, matrix, np.array([second, fourth, 0.0, 0.0, sixth]))
@@ -152,7 +152,7 @@ def test_a_folder_has_images_skeletons_readings_and_markers_in_the_order_of_thei
 def test_images_and_skeletons_are_in_one_optical_frame(folder: Path) -> None:
     items = list(NtuMocapRecording(folder))
     image = next(item for item in items if isinstance(item, RecordedDepth))
-    # what is on the right of the SDK's mirrored image is on the left
+    # the right of the SDK's mirrored image is on the left here
     assert image.depth[100, WIDTH - 1 - 400] == 1001 and image.bodies is not None
     assert image.bodies[100, WIDTH - 1 - 400] == 2 and (image.bodies == 255).sum() == WIDTH * HEIGHT - 1
     (skeleton,) = next(item for item in items if isinstance(item, RecordedFrame)).skeletons

@@ -25,7 +25,7 @@ def test_it_is_small_and_whole() -> None:
 def test_the_person_is_found_in_its_images_and_the_true_joints_are_inside() -> None:
     camera, images, joints, _ = recording()
     finder = PersonFinder(DepthCamera(camera))
-    # wrists leave the outline's inside first
+    # not the wrists, which are the first to leave the outline
     chosen = [Joint.SHOULDER_LEFT, Joint.SHOULDER_RIGHT, Joint.ELBOW_LEFT, Joint.ELBOW_RIGHT, Joint.SPINE_MID]
     inside = []
     for stamp_ns in list(images)[::30]:

@@ -56,7 +56,7 @@ OUT_OF_REACH = """roles => roles.flatMap(role => Array.from(document.querySelect
   if (hit?.closest(".mantine-Notification-root")) return false;
   return !hit || !(each.contains(hit) || hit.contains(each) || each.parentElement.contains(hit));
 }).map(each => each.innerText || each.outerHTML.slice(0, 200))"""
-"""The visible elements of these selectors whose middle is outside of the window, or under anything but a note."""
+"""The visible elements of these selectors whose middle is outside of the window, or covered, except by a note."""
 
 _PIXELS = """() => Array.from(document.querySelectorAll("img")).filter(each => each.naturalWidth > 300).map(each => {
   const canvas = document.createElement("canvas");
@@ -139,11 +139,11 @@ class Browser:
         return str(self.page.inner_text("body"))
 
     def reads(self, pattern: str) -> None:
-        """Wait until the page says so."""
+        """Wait until a text on the page matches."""
         self.until(lambda: re.search(pattern, self.text()), f"{pattern!r} on the page")
 
     def out_of_reach(self, *roles: str) -> list[str]:
-        """The controls that a finger cannot get at, after scrolling to them."""
+        """The controls that cannot be reached, even after scrolling to them."""
         self.close_notes()
         return [str(each) for each in self.page.evaluate(OUT_OF_REACH, list(roles))]
 

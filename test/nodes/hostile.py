@@ -78,7 +78,7 @@ def message(draw: random.Random, message_class: Any) -> Any:
 
 
 def changed(draw: random.Random, right: Any) -> Any:
-    """A right message with one to three of its fields drawn, wherever they are."""
+    """A valid message with one to three of its fields drawn, at any depth."""
     made = copy.deepcopy(right)
     for _ in range(draw.randint(1, 3)):
         place = made
@@ -100,7 +100,7 @@ def changed(draw: random.Random, right: Any) -> Any:
 
 
 def garbage(draw: random.Random, right: Any) -> bytes:
-    """Bytes that are no message, or hardly: cut, changed here and there, or any."""
+    """Damaged bytes of a message: truncated, changed in places, or random."""
     data = bytearray(serialize_message(right))
     way = draw.randrange(4)
     if way == 0:
@@ -115,7 +115,7 @@ def garbage(draw: random.Random, right: Any) -> bytes:
 
 
 def hostile(draw: random.Random, right: Any) -> Any:
-    """One of the three, of the same type as a right message."""
+    """A random message, a changed one or damaged bytes, of the same type as a valid message."""
     way = draw.random()
     if way < 0.5:
         return changed(draw, right)

@@ -91,7 +91,7 @@ def _run(
     folder: Path | None,
     file_size_limit: int | None,
 ) -> None:
-    """In the new process: what ``python -m body_tracking.nodes`` does."""
+    """Run in the new process: as ``python -m body_tracking.nodes`` does."""
     os.environ.clear()
     os.environ.update(environment | {PARENT_VARIABLE: str(os.getppid())})
     target = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND)

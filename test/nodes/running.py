@@ -66,7 +66,7 @@ def words_of(parameters: Mapping[str, object], name: str = "") -> list[str]:
 
 
 def refusal(folder: Path, executable: str, *arguments: str) -> str:
-    """The one line in which a node says why it does not start in a folder."""
+    """The one line with which a node refuses to start in a folder."""
     process = NodeProcess(executable, ["--ros-args", *arguments], folder / "refusal.log", environment(), folder)
     assert process.wait(60.0) == 2, process.output()
     (line,) = process.output().splitlines()
@@ -120,7 +120,7 @@ class Running:
             except subprocess.TimeoutExpired as error:
                 error.add_note(self.log(name))
                 raise
-        # else publishers of this node would be there still when the domain's turn comes again
+        # otherwise this node's publishers would still exist when the domain is used again
         self.executor.shutdown()
         self.node.destroy_node()
         rclpy.try_shutdown(context=self.context)
@@ -211,7 +211,7 @@ class Running:
         assert self.call(Trigger, "/bag_player/resume", Trigger.Request(), timeout).success
 
     def set_parameter(self, node: str, name: str, value: ParameterValue) -> tuple[bool, str]:
-        """Whether a node takes it, and why not."""
+        """Whether a node accepts the value, and the reason if not."""
         request = SetParameters.Request(parameters=[Parameter(name=name, value=value)])
         (result,) = self.call(SetParameters, f"/{node}/set_parameters", request).results
         return result.successful, result.reason
@@ -221,7 +221,7 @@ class Running:
         return (self.folder / f"{executable}.log").read_text()
 
     def until(self, condition: Callable[[], object], timeout: float = PATIENCE) -> bool:
-        """Spin until something is so; whether it became so in time."""
+        """Spin until a condition holds; returns whether it held in time."""
         return spin_until(self.executor, condition, timeout)
 
     def collect(self, kind: type[Any], topic: str, qos: QoSProfile = RELIABLE) -> list[Any]:

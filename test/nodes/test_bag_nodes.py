@@ -1,4 +1,4 @@
-"""The player and the recorder as processes over DDS: what was recorded is what arrives, byte by byte."""
+"""The player and the recorder as processes over DDS: recorded messages arrive byte by byte."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ class Bench(Running):
     """The processes of one test and a node to look at what they do."""
 
     def wait_until(self, condition: Callable[[], Any], what: str, seconds: float = 30.0) -> None:
-        """Spin until something is so; it failing is the test failing."""
+        """Spin until a condition holds; the test fails if it does not."""
         assert self.until(condition, seconds), f"waited {seconds} s for: {what}"
 
     def publish(self, hertz: float, make: Callable[[], str], *topics: str) -> None:
@@ -326,7 +326,7 @@ def test_recording_is_started_and_stopped_by_service(bench, tmp_path):
     assert len(read_bag(folder)) == n_messages
     bench.finished(recorder, signal.SIGINT)
     with BagReader(folder) as reader:
-        # What is there by itself (all but /clock, /rosout, /parameter_events) was recorded too.
+        # Topics of the nodes themselves (all but /clock, /rosout, /parameter_events) were recorded, too.
         assert "/talk" in reader.topics and "/diagnostics" in reader.topics and "/rosout" not in reader.topics
 
 

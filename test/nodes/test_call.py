@@ -31,7 +31,7 @@ class Rigs(Running):
         self.start("bag_recorder", start_recording=False, folder=folder / "file" / "bag")
         self.start_module("lab", "body_tracking.nodes", "calibration", "--ros-args", "-r", "__ns:=/lab")
         for name in (graph.START_SERVICE, f"lab/{graph.START_SERVICE}", "recorder/stop"):
-            client = self.node.create_client(Trigger, f"/{name}")  # stays, as those of the viewer do
+            client = self.node.create_client(Trigger, f"/{name}")  # is kept, like those of the viewer
             assert client.wait_for_service(60.0), name
         self.node.create_client(Trigger, "/mesh_tracker/personalise")
 

@@ -25,7 +25,7 @@ from body_tracking.recording.rosbag2 import BAG_WIRE  # noqa: E402
 
 CAMERA = Camera("camera", 128, 106, np.array([[92.0, 0.0, 64.0], [0.0, 92.0, 53.0], [0.0, 0.0, 1.0]]), np.zeros(5))
 SENSOR_DATA = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""Of many drivers: neither latched nor reliable."""
+"""The profile of many drivers: neither latched nor reliable."""
 
 
 def test_images_and_calibrations_of_a_driver_that_starts_later_and_latches_nothing(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The doctor in real ROS domains: one in which a node does most things wrong, an empty one, and no ROS at all."""
+"""The doctor in real ROS domains: one with a node that has most faults, an empty one, and no ROS at all."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ctrl-C ends a node with exit code 0 and without a word at every moment of its life, however often it comes."""
+"""Ctrl-C ends a node with exit code 0 and without output, at any moment of its life and if repeated."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def started(tmp_path: Path) -> Iterator[list[subprocess.Popen[bytes]]]:
 
 
 def said(folder: Path) -> dict[str, str]:
-    """What nodes have printed that was no information."""
+    """Output of nodes other than log messages of level INFO, by node."""
     texts = {name: (folder / f"{name}.log").read_text() for name in NODES}
     return {name: text for name, text in texts.items() if any("[INFO]" not in line for line in text.splitlines())}
 

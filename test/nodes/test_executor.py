@@ -62,7 +62,7 @@ def until(condition: object, timeout: float = 10.0) -> bool:
 
 
 def answers(node: rclpy.node.Node, count: int) -> list[str]:
-    """What the service "ask" says to so many requests at once, of those that it answers in time."""
+    """Responses of the service "ask" to ``count`` simultaneous requests, as far as they come in time."""
     other = rclpy.Context()
     rclpy.init(context=other, domain_id=node.context.get_domain_id())
     caller = rclpy.create_node("caller", context=other)

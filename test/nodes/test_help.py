@@ -1,4 +1,4 @@
-"""``--help`` of a node says what it is and what may be set, and starts nothing."""
+"""``--help`` of a node prints its purpose and its parameters, and starts nothing."""
 
 from __future__ import annotations
 

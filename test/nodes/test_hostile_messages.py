@@ -1,4 +1,4 @@
-"""Whatever messages come, no node ends, and none takes the machine's memory."""
+"""No message ends a node or lets its memory grow without bound."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ FRAMES = recorded("kinect1")
 
 
 def misstated(sec: int, nanosec: int = 0) -> TimeReference:
-    """What ``/calibration/clock`` may say of kinect2."""
+    """A message of ``/calibration/clock`` for kinect2 with this stamp and ``time_ref``."""
     reference = TimeReference(source="kinect2")
     reference.header.stamp.sec = reference.time_ref.sec = sec
     reference.header.stamp.nanosec = reference.time_ref.nanosec = nanosec
@@ -105,7 +105,7 @@ def test_fusion_recovers_after_a_wrong_clock_is_corrected(tmp_path: Path) -> Non
                 end = time.monotonic() + FRAME_NS / NANOSECONDS
                 running.until(lambda end=end: time.monotonic() > end, 1.0)
 
-        # By this clock the sensor's frames are of half an hour later, and it is seen first.
+        # By this clock the sensor's frames are half an hour later, and its frames come first.
         wrong = ClockModel(-1800 * NANOSECONDS)
         clocks.publish(clock_to_time_reference("kinect2", wrong, 1900 * NANOSECONDS, ROS))
         play(0, 0.5, (1,))
@@ -115,7 +115,7 @@ def test_fusion_recovers_after_a_wrong_clock_is_corrected(tmp_path: Path) -> Non
         newest = START_NS + 104 * FRAME_NS
         assert running.until(lambda: fused and to_nanoseconds(fused[-1].header.stamp) == newest), running.diagnostics
         stamps = [to_nanoseconds(each.header.stamp) for each in fused]
-        assert max(stamps) > START_NS + 1800 * NANOSECONDS  # it was taken for true while there was nothing else
+        assert max(stamps) > START_NS + 1800 * NANOSECONDS  # it was accepted while there was no other sensor
         assert stamps[-25:] == [START_NS + number * FRAME_NS for number in range(80, 105)]
         assert running.number("fusion", "other_clock") > 0
 
@@ -153,7 +153,7 @@ def test_recorder_without_clock_records_nothing_and_reports_it(tmp_path: Path) -
         assert running.until(lambda: left_out() > 100), running.diagnostics
         assert running.said("bag_recorder")[""] == "waiting for /clock (use_sim_time): nothing is recorded"
         assert running.said("bag_recorder")["messages"] == "0"
-        # the clock comes: of what was before, only what is latched counts
+        # the clock comes: of the earlier messages only the latched ones are recorded
         running.until(lambda: False, 1.5)
         ticks = running.node.create_publisher(Clock, graph.CLOCK_TOPIC, RELIABLE)
 
@@ -275,7 +275,7 @@ OTHERS: dict[str, tuple[str, dict[str, object]]] = {
 
 
 def right(topic: str, type_name: str) -> Any:
-    """A message as it should be on a topic."""
+    """A valid message of a topic."""
     kind = class_of(type_name)
     draw = random.Random(topic)
     if kind is PointCloud2:
@@ -313,7 +313,7 @@ def resident(running: Running) -> dict[str, int]:
 
 
 GROWTH = {"bag_recorder": 0.15}
-"""Of memory, where more than 0.05: queues of 1000 messages keep the largest that each place ever had."""
+"""Allowed growth of memory where it is more than 0.05: each slot of a queue of 1000 keeps its largest message."""
 
 
 @pytest.mark.parametrize("seed", [1])
@@ -352,7 +352,7 @@ def test_no_message_drawn_at_random_ends_a_node_or_takes_memory(
         draw, begin, before = random.Random(seed), time.monotonic(), resident(running)
         for number in range(count):
             topic = draw.choice(list(publishers))
-            with contextlib.suppress(RCLError):  # what the middleware does not even send
+            with contextlib.suppress(RCLError):  # messages that the middleware refuses to send
                 publishers[topic].publish(hostile(draw, rights[topic]))
             if number == warm:
                 before = resident(running)

@@ -29,7 +29,7 @@ from body_tracking.simulation.bags import write_bag  # noqa: E402
 from body_tracking.simulation.layouts import around  # noqa: E402
 from body_tracking.simulation.scene import Setup, simulate  # noqa: E402
 
-# A graph that tracks by inertial sensors keeps pace with a recording or loses by it.
+# A graph that tracks by inertial sensors must keep pace with the recording, or it loses accuracy.
 pytestmark = pytest.mark.alone
 
 FOREARMS = ("forearm_left", "forearm_right")
@@ -104,7 +104,7 @@ def wrists(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Wrists]:
         stamps, _ = running.truth()
 
         def ended() -> bool:
-            # not ended, but dead: nobody need wait for that
+            # if a process has died, do not wait any longer
             alive = all(process.poll() is None for process in running.processes.values())
             return not alive or (bool(running.angles) and stamp(running.angles[-1]) > stamps[-1] - 0.3)
 
@@ -137,7 +137,7 @@ Angles = dict[float, tuple[dict[str, float], dict[str, float]]]
 
 @pytest.fixture(scope="module")
 def offline(wrists: Wrists, tmp_path_factory: pytest.TempPathFactory) -> Angles:
-    """The same offline."""
+    """The angles of the offline graph."""
     out = tmp_path_factory.mktemp("replayed") / "offline"
     replay(wrists.bag, out, ReplaySettings(("kinect1",), filter_name="ekf", imus=FOREARMS))
     with BagReader(out) as reader:
@@ -152,7 +152,7 @@ def offline(wrists: Wrists, tmp_path_factory: pytest.TempPathFactory) -> Angles:
 
 
 def test_pronation_follows_the_truth_that_no_skeleton_camera_sees(wrists: Wrists, offline: Angles) -> None:
-    """Of the replay: when the live graph aligns a sensor depends on the machine, and how well with it."""
+    """Checked on the replay: when the live graph aligns a sensor, and how well, depends on the machine."""
     stamps, values = wrists.truth()
     for side in ("left", "right"):
         end = stamps[-1] if side == "left" else stamps[0] + OFF_FROM
@@ -168,7 +168,7 @@ def test_pronation_follows_the_truth_that_no_skeleton_camera_sees(wrists: Wrists
         bent = np.interp(times, stamps, flexion) > 0.5
         assert bent.sum() > 60
         off = np.degrees(angles - np.interp(times, stamps, true))[bent]
-        # one Kinect alone is 54 and 56 degrees off in this recording; what is left is how a person holds a T-pose
+        # one Kinect alone is 54 and 56 degrees off in this recording; the rest is the person's error in the T-pose
         assert np.sqrt((off**2).mean()) < 25.0
 
 
@@ -192,7 +192,7 @@ def test_silent_sensor_is_reported(wrists: Wrists) -> None:
 
 
 def bad_ones() -> list[Imu]:
-    """What drivers send that should not."""
+    """Invalid messages that drivers send."""
 
     def still(change: Callable[[Imu], None]) -> Imu:
         message = Imu()
@@ -246,7 +246,7 @@ def test_bad_messages_are_counted(wrists: Wrists) -> None:
     assert wrists.processes["imu_skeleton"].poll() is None
     assert topic in wrists.said("imu_skeleton").get("last malformed", "")
     assert topic in wrists.log("imu_skeleton")
-    # an orientation that is none does not stop the filter either
+    # an invalid orientation does not stop the filter either
     others = wrists.node.create_publisher(Imu, graph.orientation_topic("forearm_left"), RELIABLE)
     assert wrists.until(lambda: others.get_subscription_count() >= 1)
     refused = [Imu(), bad_ones()[1]]

@@ -1,4 +1,4 @@
-"""Every node as a process, asked by its real parameter services: what is live takes effect, the rest says why not."""
+"""The parameter services of every node as a process: live parameters take effect, the others are refused by reason."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Graph(Running):
         self.angles = self.collect(JointState, graph.joint_states_topic("body1"))
 
     def set(self, node: str, **values: object) -> list[tuple[bool, str]]:
-        """Whether each is set, and why not."""
+        """Whether each was set, and the reason if not."""
         parameters = [Parameter(name=name, value=_value(value)) for name, value in values.items()]
         answer = self.call(SetParameters, f"/{node}/set_parameters", SetParameters.Request(parameters=parameters))
         return [(result.successful, result.reason) for result in answer.results]

@@ -48,7 +48,7 @@ COLOURED = pixels_where("high - low > 40")
 
 
 def messages(stages: list[Stage]) -> list[dict[str, bytes]]:
-    """What the nodes publish of the first pairs of images of the shipped recording, by time and topic."""
+    """The nodes' messages for the first pairs of images of the shipped recording, by time and topic."""
     frames: dict[int, dict[str, bytes]] = {}
 
     def keep(topic: str, cdr: bytes, at_ns: int) -> None:
@@ -90,7 +90,7 @@ def test_a_browser_shows_balls_points_and_targets(tmp_path: Path) -> None:
                 return True
 
             def drawn() -> Any:
-                """What is drawn is one of the published sets of points."""
+                """Whether one of the published sets of points is drawn."""
                 publish()
                 points = browser.joints("/markers/points")
                 sent = [SpacePoints().decode(frame[setup.POINTS], BAG_WIRE).positions for frame in frames]

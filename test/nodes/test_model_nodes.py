@@ -1,4 +1,4 @@
-"""The extended filter and its joint angles as processes over DDS: what they publish, survive, and say in a silence."""
+"""The extended filter and its joint angles as processes over DDS: outputs, invalid input, and silent sensors."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ STATE, COVARIANCE = graph.MODEL_STATE, graph.MODEL_COVARIANCE
 
 
 class Tracking(Running):
-    """Filter and angles; the test is sensors and calibration, with a shipped recording and its true calibration."""
+    """Filter and angles; the test plays sensors and calibration: a shipped recording and its true calibration."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
@@ -70,7 +70,7 @@ class Tracking(Running):
         self.start("skeleton_filter", reliable=True, filter="ekf", predict_after=0.3)
 
     def calibrate(self) -> None:
-        """The truth, once, from the beginning on."""
+        """Publish the true calibration once, in force from the beginning."""
         clock = next(message for topic, message in self.calibration if topic.endswith("clock"))
         self.clocks.publish(clock)
         for topic, message in self.calibration:
@@ -106,7 +106,7 @@ class Tracking(Running):
         self.at += round(seconds * 60)
 
     def play_until(self, condition: Callable[[], object]) -> bool:
-        """Frame after frame, since nodes that connect anew may miss some; whether it became so in time."""
+        """Play frame after frame, since nodes that connect anew may miss some; returns whether it held in time."""
 
         def one_more() -> object:
             self.play(1)
@@ -186,7 +186,7 @@ def test_late_subscriber_gets_the_urdf(tracking: Tracking) -> None:
 
 def test_without_inputs_the_filter_predicts_and_then_stops(tracking: Tracking) -> None:
     def predicted_ones() -> list[Skeleton]:
-        """Those after the last in which a sensor saw something."""
+        """The skeletons after the last with a tracked joint."""
         seen = [cloud_to_skeletons(cloud)[0] for cloud in tracking.skeletons]
         real = [number for number, each in enumerate(seen) if (each.states == TrackingState.TRACKED).any()]
         return seen[real[-1] + 1 :] if real else []
@@ -203,7 +203,7 @@ def test_without_inputs_the_filter_predicts_and_then_stops(tracking: Tracking) -
         tracking.until(lambda: len(predicted_ones()) >= 15, 5.0)
         tracking.until(lambda: False, timeout=2.5)
         predicted = predicted_ones()
-        # one that came too late is no real one, and the 2 s count from it all the same
+        # a frame that came too late has no tracked joint, but the 2 s count from it
         if 15 <= len(predicted) <= 52 and 1.0 * NANOSECONDS <= lasted(predicted) <= 1.8 * NANOSECONDS:
             break
     assert 15 <= len(predicted) <= 55
@@ -281,7 +281,7 @@ def test_invalid_state_or_covariance_is_counted(tracking: Tracking) -> None:
 
 
 def test_change_of_filter_keeps_the_sensor_poses(tracking: Tracking) -> None:
-    for name, sensors in (("lkf_constant_velocity", 0), ("ekf", 1)):  # a linear filter takes what the fusion makes
+    for name, sensors in (("lkf_constant_velocity", 0), ("ekf", 1)):  # a linear filter takes fused skeletons
         assert tracking.set_parameter("skeleton_filter", "filter", ParameterValue(type=4, string_value=name))[0]
         assert tracking.until(
             lambda count=sensors: all(p.get_subscription_count() == count for p in tracking.publishers.values())

@@ -61,7 +61,7 @@ def test_every_name_of_a_node_is_in_its_namespace(executable: str) -> None:
     finally:
         rclpy.try_shutdown()
     own = {name for name in used - names.WHOLE_DOMAIN if name.startswith("/lab/left/")}
-    # what a user's own file names with a leading slash holds everywhere
+    # names with a leading slash in a user's file hold in every namespace
     outside = {"/iiwa7/forward_position_controller/commands", "/iiwa7/joint_states"}
     assert used - names.WHOLE_DOMAIN - own == (outside if executable == "robot_commands" else set())
     assert bool(own) == (executable != "bag_recorder")

@@ -67,7 +67,7 @@ def test_a_sender_that_ends_and_comes_again_is_followed_without_a_restart(tmp_pa
 
 
 def markers(stamp: int, bodies: tuple[int, ...] = (3,)) -> MarkerArray:
-    """As Microsoft's driver fills them."""
+    """A message like those of Microsoft's driver."""
     array = MarkerArray()
     for body in bodies:
         for joint in AzureJoint:

@@ -1,4 +1,4 @@
-"""The nodes as processes over DDS: what they refuse, what they survive, what they say of it."""
+"""The nodes as processes over DDS: refused input, invalid messages, and their reports."""
 
 from __future__ import annotations
 
@@ -272,7 +272,7 @@ def test_late_subscriber_gets_the_calibration_and_services_answer(nodes: Running
 def test_a_recording_plays_as_it_was_recorded(tmp_path: Path) -> None:
     with Running(tmp_path) as running:
         received = running.collect(PointCloud2, "/kinect2/skeleton")
-        start = time.time() + 10.0  # by then it knows who listens, on a busy machine too
+        start = time.time() + 10.0  # by then it has discovered its subscribers, also on a busy machine
         running.start("kinect_skeleton", sensor="kinect2", file=BAG, rate=20.0, reliable=True, start_time=start)
         frames = recorded("kinect2")
         with RigReader(BAG) as reader:
@@ -348,7 +348,7 @@ def test_backend_of_another_package_is_found_and_its_failure_reported(tmp_path: 
         failure = "OSError: the cable was pulled"
         assert running.until(lambda: running.said("kinect_skeleton").get("") == failure, 60.0)
         assert running.said("kinect_skeleton").get("published", "") == "3"
-        assert "in read" in running.log("kinect_skeleton")  # where, for who writes it
+        assert "in read" in running.log("kinect_skeleton")  # the place of the error, for the backend's author
         assert process.poll() is None
         assert stop(process) == 0
 

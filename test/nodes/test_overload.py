@@ -82,8 +82,8 @@ def test_slow_node_drops_old_frames_and_reports_them(slow: Slow) -> None:
         left_out = slow.standstill.left_out[topic]  # where the machine stood still
         return handled + slow.backlog.dropped[topic] + slow.sequences.lost[topic] + left_out
 
-    # A publisher knows its subscription before that knows the publisher: what came before the first frame that is
-    # handled was never received. With the next one handled, nothing of that is on its way any more.
+    # A publisher discovers its subscription before the subscription discovers the publisher: frames before the first
+    # handled one were never received. Once the next one is handled, none of them is on its way any more.
     end = time.monotonic() + PATIENCE
     for frames in (1, 2):
         while (

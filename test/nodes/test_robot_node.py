@@ -88,7 +88,7 @@ class Arm:
     mapping: RobotMapping
     body: SimulatedArm
     commands: list[tuple[float, float, FloatArray]] = field(default_factory=list)
-    """When a command came and when it was made (wall time, seconds; NaN where it does not say), and what it was."""
+    """Time of receipt, stamp (wall time, seconds; NaN without one) and position of each command."""
     stood: list[tuple[float, FloatArray]] = field(default_factory=list)
 
     def moving(self) -> bool:
@@ -149,7 +149,7 @@ class Robots(Running):
 
 
 class PlayedRobots(Robots):
-    """Besides, a node each that commands them, and a player in place of the graph."""
+    """Arms with a ``robot_commands`` node each, and a player in place of the graph."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
@@ -167,7 +167,7 @@ class PlayedRobots(Robots):
         self.command("iiwa7", body=BODIES["iiwa7"], use_sim_time=True)
 
     def _relay(self, publisher: Any, played: str, live: str) -> Any:
-        """The angles of a person of the bag as those of one who is seen now."""
+        """A callback that republishes the angles of a person in the bag with present stamps."""
 
         def on_angles(message: JointState) -> None:
             stamp_ns = to_nanoseconds(message.header.stamp)
@@ -186,15 +186,15 @@ class PlayedRobots(Robots):
         self.start("bag_player", bag=self.bag, loop=True, wait_for_subscribers=f"['{SENSOR}:3']", wait_timeout=60.0)
 
     def robot(self, robot: str) -> dict[str, str]:
-        """The last diagnostics of what commands a robot."""
+        """The last diagnostics of a robot's ``robot_commands``."""
         return self.said(f"{robot}_commands")
 
     def in_state(self, *states: State) -> bool:
-        """Whether the last diagnostics of every robot say one of these."""
+        """Whether every robot is in one of these states, by the last diagnostics."""
         return all(self.robot(robot).get("state") in states for robot in self.arms)
 
     def kill_while_moving(self) -> float:
-        """End the sensor as a crash does, while both arms follow and move; the wall time of it."""
+        """Kill the sensor while both arms follow and move; returns the wall time."""
         moving = {name: arm.moving for name, arm in self.arms.items()}
         assert self.until(lambda: self.in_state(State.FOLLOWING) and all(m() for m in moving.values()), 90.0), {
             name: (self.robot(name), self.log(f"{name}_commands")[-2000:]) for name in self.arms
@@ -208,7 +208,7 @@ class PlayedRobots(Robots):
 
 @dataclass(frozen=True)
 class Run:
-    """What a run left behind: the arms, and per killing its time and what was said and heard after it."""
+    """Results of a run: the arms, and for each kill its time, the reported reasons, and the commands after it."""
 
     arms: dict[str, Arm]
     killed: tuple[float, ...]
@@ -291,7 +291,7 @@ def test_the_arm_stands_within_a_tenth_of_a_second_of_the_sensors_death(run: Run
     for number, killed in enumerate(run.killed):
         for arm in run.arms.values():
             commands = of_one_run(run, arm, number)
-            # made when, by their stamps; an array has none, and is taken to be made when it came
+            # time of each command: its stamp, or its receipt for arrays, which have no stamp
             made = [came if np.isnan(stamp) else stamp for came, stamp, _ in commands]
             last = max(k for k in range(1, len(commands)) if (commands[k][2] != commands[k - 1][2]).any())
             braking = np.where(np.isfinite(arm.mapping.acceleration), arm.mapping.rate / arm.mapping.acceleration, 0.0)
@@ -348,7 +348,7 @@ def test_the_example_follows_prints_and_draws(tmp_path: Path) -> None:
 
 
 def joints_of(mapping: RobotMapping, angles: Sequence[tuple[float, JointState]], when: FloatArray) -> FloatArray:
-    """(n, joints) where a mapping would have a robot stand by the angles that the graph published.
+    """(n, joints) a robot's positions by a mapping and the angles that the graph published.
 
     Args:
         mapping: the robot's.
@@ -379,8 +379,8 @@ def test_an_arm_follows_two_sensors_through_the_whole_graph_and_holds_when_they_
         angles: list[tuple[float, JointState]] = []
         topic = graph.joint_states_topic("body1")
         robots.node.create_subscription(JointState, topic, lambda each: angles.append((time.time(), each)), RELIABLE)
-        # At half the speed, again and again, and with a longer silence allowed: a busy machine that cannot track at
-        # full speed holds the robot, as it must. How soon an arm stands with the shipped limits is told above.
+        # At half the speed, in a loop, and with a longer allowed silence: a busy machine that cannot track at full
+        # speed holds the robot, as it must. The shipped limits are tested above.
         mapping, silence = tmp_path / "two_joint_arm.yaml", 0.3
         shipped = mapping_file("two_joint_arm").read_text()
         mapping.write_text(f"{shipped}  silence: {silence}\n  max_age: {2 * silence}\n")
@@ -394,7 +394,7 @@ def test_an_arm_follows_two_sensors_through_the_whole_graph_and_holds_when_they_
         begun = len(arm.commands)
 
         def travelled() -> float:
-            """Radians between the extremes of what the second joint was commanded, since it followed."""
+            """Radians between the extreme commands of the second joint since it follows."""
             return float(np.ptp([position[1] for _, _, position in arm.commands[begun:]] or [0.0]))
 
         # long and far enough for the comparison below, whenever in the recording a busy machine let it begin
@@ -415,9 +415,9 @@ def test_an_arm_follows_two_sensors_through_the_whole_graph_and_holds_when_they_
         assert re.search(rf"\| robot ({'|'.join(State)})", robots.log("up"))  # the status line, every 5 s
         assert stop(up) == 0, robots.log("up")
     (robot_log,) = [path.read_text() for path in tmp_path.glob("*/robot_commands.log")]
-    # How late the angles come, here and at the robot's node, depends on the machine and changes within a second. So a
-    # command has to lie between the least and the largest that the angles asked for within half a second of it; those
-    # made while the robot held and came back are left out.
+    # The delay of the angles, here and at the robot's node, depends on the machine and changes within a second. So a
+    # command has to lie between the least and the largest position by the angles within half a second of it; commands
+    # while the robot held and came back are left out.
     came = np.array([each[0] for each in followed])
     while_following = np.any([(came > begin) & (came < end) for begin, end in following(robot_log)], axis=0)
     assert while_following.sum() > 200, robot_log
@@ -425,7 +425,7 @@ def test_an_arm_follows_two_sensors_through_the_whole_graph_and_holds_when_they_
     shifted = np.array([joints_of(arm.mapping, angles, came + shift) for shift in np.arange(-0.5, 0.51, 0.02)])
     off = np.degrees(np.maximum(commanded - shifted.max(axis=0), shifted.min(axis=0) - commanded)).max(axis=1)
     assert np.quantile(off, 0.9) < 5.0, np.quantile(off, [0.5, 0.9, 1.0])
-    # up to when diagnostics said that it held, its commands changed for no longer than that
+    # after the kill, commands changed for no longer than the allowed silence
     last = max((k for k in range(1, len(after)) if (after[k][2] != after[k - 1][2]).any()), default=0)
     assert len(after) > last + 1
     held_up = stall([killed, *[came for came, _, _ in after[: last + 2]]])

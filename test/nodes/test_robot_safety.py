@@ -54,7 +54,7 @@ def mapping(name: str, folder: Path, *, state: bool) -> Path:
     output = {"kind": "float64_multi_array", "topic": f"/{name}/commands", "order": ["shoulder"]}
     if state:
         output["state_topic"] = f"/{name}/joint_states"
-    # gentle with a machine that is busy: what these tests are about are other faults than a short silence
+    # tolerant of a busy machine: these tests are about other faults than a short silence
     safety = {
         "calibration": False,
         "silence": 1.0,
@@ -77,7 +77,7 @@ class Robot:
         age: seconds, of the angles when they are sent.
         convention: of the angles.
         names: of the angles.
-        doubled: whether a second publisher says the opposite angle.
+        doubled: whether a second publisher sends the opposite angle.
         position: of the arm, radians; it follows the commands while ``released``.
         commands: received ones, radians.
     """
@@ -121,7 +121,7 @@ class Robot:
         return self.said().startswith("following") and bool(self.commands)
 
     def until_it_follows(self) -> None:
-        """Until it is where the person is; a machine that stood still itself has stopped the robot, as it should."""
+        """Wait until the arm has the person's angle; enable it again if a standstill of the machine stopped it."""
 
         def arrived() -> bool:
             return self.follows() and abs(self.commands[-1] - self.angle) < 0.02
@@ -303,7 +303,7 @@ def test_angles_of_two_alternating_publishers_are_refused(bench: Bench) -> None:
     robot.until_it_follows()
     robot.doubled = True
     robot.until_it_says("stopped", "two publishers in turn")
-    # on a busy machine only one of the two may come through for a while, which is all that a robot can tell them by
+    # on a busy machine messages of only one of the two may arrive for a while, which cannot be detected
     assert any(robot.is_told_nothing() for _ in range(4))
     assert min(robot.commands) > -0.1  # and the other one was never followed
     robot.doubled = False

@@ -46,7 +46,7 @@ READERS = {
     "robot_commands": {SENSOR, graph.CALIBRATION, ANGLES},
     "bag_recorder": {SENSOR, graph.CALIBRATION, ANGLES},
 }
-"""What each listens to; the viewer, which would slow this process down for good, has the same base."""
+"""The topics of each node; the viewer, which would slow this process down, has the same base class."""
 
 
 class Readers:
@@ -68,7 +68,7 @@ class Readers:
         self.latest |= {status.node: status for status in statuses(message)}
 
     def doubled(self) -> list[str]:
-        """What they name."""
+        """The topics with several publishers, by the diagnostics."""
         return [key for status in self.latest.values() for key in status.values if key.startswith("publishers ")]
 
     def until(self, condition: Callable[[], object], timeout: float = 30.0) -> bool:

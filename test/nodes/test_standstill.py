@@ -31,7 +31,7 @@ class Live(Running):
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
-        # as below ``up``: over UDP, whose buffers keep what comes while a process is stopped
+        # as under ``up``: over UDP, whose buffers keep messages while a process is stopped
         del self.environment["ROS_AUTOMATIC_DISCOVERY_RANGE"]
         with patch.dict(os.environ, self.environment, clear=True):
             dds.stay_on_this_machine()
@@ -47,7 +47,7 @@ class Live(Running):
         self.node.create_subscription(JointState, graph.joint_states_topic("body1"), self.note, RELIABLE)
 
     def note(self, angles: JointState) -> None:
-        """Angles came."""
+        """Record capture and arrival of angles."""
         self.stamps.append((to_nanoseconds(angles.header.stamp), time.time_ns()))
 
 
@@ -70,7 +70,7 @@ def stopped_and_continued(live: Live, name: str) -> tuple[float, float]:
     assert live.until(lambda: sum(stamp > continued_ns for stamp, _ in live.stamps) > 60, 30.0)
     undisturbed = [*before, *(each for each in live.stamps if each[0] > continued_ns)]
     delay = max(arrival - stamp for stamp, arrival in undisturbed)
-    # One may have been between the last look at the clock and the system call that sends it, which nothing can see.
+    # One message may have been between the last check of the clock and the system call that sends it.
     oldest = continued_ns - sorted(stamp for stamp, _ in live.stamps)[1]
     return oldest / NANOSECONDS, delay / NANOSECONDS
 
@@ -79,7 +79,7 @@ def stopped_and_continued(live: Live, name: str) -> tuple[float, float]:
 def test_no_old_angles_are_published_after_a_standstill(live: Live, name: str) -> None:
     for _ in range(3):
         oldest, delay = stopped_and_continued(live, name)
-        # A message is left out where it was sent so long before; on a busy machine the nodes add their own delay.
+        # A message older than MAX_AGE is dropped; on a busy machine the nodes add their own delay.
         assert oldest < MAX_AGE + max(0.2, delay)
         if delay < STOPPED / 2:
             return

@@ -98,7 +98,7 @@ def test_a_browser_shows_the_graph_and_its_buttons_work(browser: Browser, tmp_pa
     for label in ("left elbow flexion", "right shoulder elevation"):
         assert page.locator(f"input[value='{label}']").count()
 
-    # The nodes say how they are, and the state is in words.
+    # The page shows the nodes' reports, and the state in words.
     browser.until(lambda: re.search(r"playing tpose_torso_twist, [\d.]+ of", page.inner_text("body")), "the bag's name")
     browser.until(lambda: re.search(r"skeleton_filter\s+\d+ Hz", page.inner_text("body")), "rates of the nodes")
     if PICTURES:
@@ -145,7 +145,7 @@ def test_a_browser_shows_the_graph_and_its_buttons_work(browser: Browser, tmp_pa
     browser.answer("plays on from")
     browser.until(follows, "the bag at its end")
 
-    # What no node offers is not on the page, and an end is said.
+    # Services that no node offers are not on the page, and the end is reported.
     assert stop(running.processes.pop("bag_recorder")) == 0
     browser.until(lambda: not page.get_by_role("button", name="record", exact=True).count(), "no button without a node")
     assert stop(running.processes.pop("viewer")) == 0

@@ -40,7 +40,7 @@ NODES = {
     "floor": "/floor",
     "frames": "/segments",  # those of ekf
 }
-"""What the scene has of each layer."""
+"""The nodes of each layer in the scene."""
 
 
 @pytest.fixture
