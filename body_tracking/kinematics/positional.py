@@ -37,6 +37,8 @@ are about an axis that the positions do not determine: the standard deviation gr
 the deflection that gives the direction (the elevation, the elbow flexion) is not significant: less than 3.7 of its own
 standard deviations, which noise alone exceeds once in a thousand frames.
 
+A twist of shoulders against hips beyond 70 deg, the most that a person can, has the excess as an error of its own.
+
 Velocities are the Jacobian times the joint velocities. A skeleton has no covariance of its velocities; the stated
 deviation is a bound. For a point driven by white acceleration of density q, the velocity variance of a Kalman filter in
 its steady state is (2 q^2 p)^(1/3) with p its position variance, and (3 q^2 p)^(1/3) after a long prediction without
@@ -47,6 +49,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import Final
 
 import numpy as np
 
@@ -131,6 +134,10 @@ _ROWS = [row[0] for row in (*_BETWEEN, *_DIHEDRAL)]
 _ORDER: IntArray = np.array([_ROWS.index(name) for name in ANGLE_NAMES], dtype=np.intp)
 """Row of the two tables, one after the other, for each name; all below is in the order of the rows."""
 _N_BETWEEN, _N_ANGLES = len(_BETWEEN), len(ANGLE_NAMES)
+_TWIST: Final = _ROWS.index("trunk_axial_lean")
+_MOST_TWIST: Final = math.radians(70.0)
+"""Largest twist of shoulders against hips: 50 degrees of the spine (``kinematics.ranges``), the rest of the clavicles.
+Where a sensor swaps left and right of one girdle it is larger for some frames; the excess is an error."""
 
 _JOINTS: IntArray = np.unique(np.concatenate([_FROM, _TO]))
 """The joints that any angle uses."""
@@ -291,6 +298,7 @@ def positional_angles(skeleton: Skeleton, of_bones: float = BONE_CORRELATION) ->
             across = variance[n:]
             unknown[_N_BETWEEN:] |= _insignificant(angles[:_N_BETWEEN], variance[:_N_BETWEEN])
             variance[:_N_BETWEEN] += across * np.minimum(1.0, 2.0 * across / sine**2)
+            variance[_TWIST] += max(abs(float(angles[_TWIST])) - _MOST_TWIST, 0.0) ** 2
             stddev = np.sqrt(variance[:n])
             unknown |= ~(stddev <= _MAX_STDDEV)
             stddev[unknown] = np.inf

@@ -207,6 +207,20 @@ def test_a_straight_elbow_keeps_its_band_and_hides_the_rotation() -> None:
     assert unknown / count > 0.99
 
 
+@pytest.mark.parametrize("twist", [40.0, 60.0, 90.0, 150.0])
+def test_a_twist_that_no_person_can_do_has_the_excess_as_an_error(twist: float) -> None:
+    """A Kinect at the side of a person swaps left and right of hips or shoulders for some frames."""
+    body = t_pose()
+    upper = [joint for joint in Joint if body[joint, 2] > body[Joint.SPINE_MID, 2]]
+    body[upper] = Rotation.from_euler("z", twist, degrees=True).apply(body[upper])
+    found = positional_angles(skeleton(body, 0.01))
+    column = found.names.index("trunk_axial_lean")
+    assert np.degrees(abs(found.position[column])) == pytest.approx(twist, abs=1.0)
+    straight = positional_angles(skeleton(t_pose(), 0.01)).position_stddev[column]
+    stated = np.degrees(np.hypot(straight, np.radians(max(twist - 70.0, 0.0))))
+    assert np.degrees(found.position_stddev[column]) == pytest.approx(stated, rel=0.1)
+
+
 def test_an_unknown_joint_hides_its_own_angles_and_no_other() -> None:
     positions = bent_pose(0)
     positions[Joint.WRIST_LEFT] = np.nan
