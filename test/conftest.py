@@ -1,4 +1,4 @@
-"""What all tests share: the real recordings, where they are present, and which of them start processes."""
+"""Fixtures of all tests, such as the real recordings where present, and the marks of tests that start processes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-# As the commands and nodes have it, before numpy is imported: BLAS adds up in another order with more threads.
+# As in the commands and nodes, before numpy is imported: BLAS sums in another order with more threads.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
@@ -24,9 +24,9 @@ ROOT = Path(__file__).resolve().parent.parent
 # one set of examples in `make test`, so that a change is to blame when it fails; others each time in `make test-all`
 settings.register_profile("busy machine", deadline=None, derandomize=not ALL, max_examples=draws(15, 100))
 settings.load_profile("busy machine")
-dds.prepare()  # what tests send is sent again as soon as what nodes send
+dds.prepare()  # lost messages of tests are resent as soon as those of nodes
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    # so a shell without job control starts what it runs in the background, and every process would inherit it
+    # a shell without job control ignores SIGINT in background jobs, and every process would inherit that
     signal.signal(signal.SIGINT, signal.default_int_handler)
 PROCESSES = (
     *("nodes", "ros2", "test_cli.py", "test_docs.py", "test_fifth_system.py", "test_live_equals_offline.py"),
@@ -130,7 +130,7 @@ def wave(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def t_pose(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Its first 4 s, for commands that need only run."""
+    """The first 4 s of ``wave``, for commands that need only run."""
     from excerpts import beginning
 
     return _made_once(tmp_path_factory, "t_pose", lambda bag: beginning(ROOT / "bags" / "tpose_wave", bag, 4.0))
@@ -146,7 +146,7 @@ def replayed_wave(tmp_path_factory: pytest.TempPathFactory, wave: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def extended_wave(tmp_path_factory: pytest.TempPathFactory, wave: Path) -> Path:
-    """The same with the extended filter."""
+    """As ``replayed_wave``, with the extended filter."""
     from body_tracking.recording.replay import ReplaySettings, replay
 
     settings = ReplaySettings((), filter_name="ekf")

@@ -10,7 +10,7 @@ from functools import cache
 
 @cache
 def _in_turn() -> itertools.cycle[int]:
-    """This worker's, in an order of its own: none comes again before all others were there."""
+    """The domains of this worker, in an order of its own; each is used again only after all others."""
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
     own = range(1 + worker, 101, workers)
@@ -18,5 +18,5 @@ def _in_turn() -> itertools.cycle[int]:
 
 
 def domain() -> int:
-    """From 1 to 100; what runs at the same time, in this worker or in others, has none in common."""
+    """A domain from 1 to 100, different from those of all tests that run at the same time, in any worker."""
     return next(_in_turn())

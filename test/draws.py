@@ -1,4 +1,4 @@
-"""How much is drawn where chance plays, or of many recordings: a few in ``make test``, all in ``make test-all``."""
+"""Number of random seeds, or of recordings, in a test: a few in ``make test``, all in ``make test-all``."""
 
 from __future__ import annotations
 
@@ -17,5 +17,5 @@ def draws(few: int, many: int) -> int:
 
 
 def some(items: Sequence[Item], count: int = 1) -> Sequence[Item]:
-    """So many of a list, evenly spread; all of them in ``make test-all``."""
+    """``count`` items of a list, evenly spread; all of them in ``make test-all``."""
     return items if ALL else items[:: max(1, len(items) // count)][:count]

@@ -19,5 +19,5 @@ NODES = ("camera_skeleton", "camera_rig")
 
 
 def startable(executables: Sequence[str]) -> tuple[str, ...]:
-    """The nodes that can start here: without the networks all but two."""
+    """The nodes that can start here; without the networks two are missing."""
     return tuple(name for name in executables if not MISSING or name not in NODES)

@@ -1,4 +1,4 @@
-"""What is left out where a node is too slow: nothing while it was held up once, and then the oldest."""
+"""Frames that a slow node drops: none after a single delay, the oldest if it is always too slow."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ DEPTH = 16
 def run(
     work_s: float, seconds: float, stall: tuple[float, float] = (0.0, 0.0)
 ) -> tuple[Backlog, list[int], Counter[str]]:
-    """A node that works so long on each frame of two sensors, and once is held up.
+    """A node that works ``work_s`` on each frame of two sensors, and is delayed once: ``stall`` is (time, duration).
 
     Returns:
-        Its backlog, how long each frame that it handled had waited, and how many were lost in full readers.
+        Its backlog, the waiting times of the handled frames in nanoseconds, and counts of frames lost in full readers.
     """
     backlog, waited, lost = Backlog(), [], Counter[str]()
     queue: list[tuple[str, int]] = []

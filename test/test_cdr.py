@@ -1,4 +1,4 @@
-"""Messages as CDR bytes: what is written and read directly is what the serialisers write and read."""
+"""Messages as CDR bytes: direct writing and reading equals that of the serialisers."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def test_padding_bytes_are_ignored() -> None:
 
 
 def estimate(seed: int, stamp_ns: int = 10**9, frame_id: str = "world") -> ModelEstimate:
-    """Random."""
+    """A random estimate."""
     random = np.random.default_rng(seed)
     root = random.normal(size=(2, MODEL.nv, MODEL.nv))
     covariance = np.zeros((2 * MODEL.nv, 2 * MODEL.nv))

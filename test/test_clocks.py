@@ -50,7 +50,7 @@ def test_a_clock_is_the_same_by_its_offset_at_another_time(
     clock = ClockModel(offset, drift, anchor)
     moved = clock.carried_to(other)
     assert moved.anchor_ns == other
-    # of the product of drift and some decades a float keeps a microsecond
+    # a float holds the product of drift and decades to a microsecond
     assert abs(moved.to_sensor(at) - clock.to_sensor(at)) <= 1000
 
 

@@ -1,4 +1,4 @@
-"""Compiled functions: what machine code of theirs is kept, and when it is made anew."""
+"""Compiled functions: which machine code is cached, and when it is compiled anew."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def cache(tmp_path: Path) -> Path:
 def run(folder: Path, cache: Path) -> str:
     """The value of ``outer(1)`` in a new process, and whether its code came from the cache."""
     path = os.pathsep.join([str(folder), *filter(None, sys.path)])
-    # Python's own cache takes a file of the same size and second for the same
+    # Python's own cache treats a file of equal size and time in seconds as unchanged
     environment = {**os.environ, "PYTHONPATH": path, "XDG_CACHE_HOME": str(cache), "PYTHONDONTWRITEBYTECODE": "1"}
     command = [sys.executable, "-c", _SCRIPT]
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PATIENCE, check=True).stdout

@@ -1,4 +1,4 @@
-"""README.md and the pages in ``docs/``: every command in them runs, or says at its top why not.
+"""README.md and the pages in ``docs/``: every command in them runs, or states why not.
 
 The rule: blocks fenced as ``sh`` of a page are run one after the other, by bash, in a folder that has everything of
 the repository (and nothing of the page before; of one recording, its first 7 s), and must all end with exit code 0. A
@@ -39,12 +39,12 @@ def blocks(page: Path) -> list[tuple[str, str]]:
 
 
 def commands(page: Path) -> list[str]:
-    """What of a page is to be run."""
+    """The commands of a page that are to be run."""
     return [text for language, text in blocks(page) if language == "sh" and not MARK.match(text)]
 
 
 ALONE = {"troubleshooting": pytest.mark.alone}
-"""doctor finds fault with a machine on which others work."""
+"""doctor reports problems on a machine with other load."""
 SLOW = dict.fromkeys(("reading_uncertainty", "choosing_a_filter", "markers"), pytest.mark.slow)
 """Most of their commands are also those of the README, or they compute on images for long."""
 
@@ -107,7 +107,7 @@ def test_commands_of_the_documentation_work(page: Path, tmp_path: Path, t_pose: 
 
 
 def test_skipped_commands_state_a_reason() -> None:
-    """So that no block is left out by a misspelt mark."""
+    """Otherwise a misspelt mark would skip a block."""
     for page in PAGES:
         for language, text in blocks(page):
             first = text.partition("\n")[0]

@@ -24,14 +24,14 @@ HEIGHT = "/humans/height"
 
 
 class _Nobody:
-    """Takes what people press."""
+    """A target for the page's controls without effect."""
 
     def __getattr__(self, name: str) -> Any:
         return lambda *given: ""
 
 
 def command(*words: str | Path) -> str:
-    """What a command of ours prints, with the system installed."""
+    """The output of a command of ours, with the system installed."""
     path = os.pathsep.join([str(ROOT), str(ROOT / "examples" / "fifth_system")])
     environment = {**os.environ, "PYTHONPATH": path, "ROS_DOMAIN_ID": str(domain())}
     done = subprocess.run(
@@ -42,7 +42,7 @@ def command(*words: str | Path) -> str:
 
 
 def heights(bag: Path, margin: float) -> dict[int, float]:
-    """By stamp; each is what the filtered skeleton of the same recording says."""
+    """The published heights by stamp; each agrees with the filtered skeleton of the recording."""
     with BagReader(bag) as reader:
         type_name = reader.topics[HEIGHT].type_name
         messages = [deserialize(type_name, raw.cdr) for raw in reader.messages([HEIGHT])]

@@ -1,4 +1,4 @@
-"""The table of the graph holds together, and everyone who starts the graph uses it."""
+"""The table of the graph is consistent, and every way to start the graph uses it."""
 
 from __future__ import annotations
 
@@ -120,14 +120,14 @@ def test_external_sensors_need_no_nodes() -> None:
 
 
 def counted(**given: Any) -> dict[str, int]:
-    """How many nodes take each topic of a graph."""
+    """The number of nodes that take each topic of a graph."""
     played = tuple(map(graph.skeleton_topic, graph.DEFAULT_SENSORS)) if given.get("bag") else ()
     specs = nodes_for(options_of(**given, played=played))
     return subscribers(specs, parameters_for(specs, None))
 
 
 def published_angles(options: Options) -> tuple[str, ...]:
-    """The ids of the people of whom a graph publishes angles."""
+    """The ids of the people whose angles a graph publishes."""
     specs = nodes_for(options)
     return tuple(topic.split("/")[3] for topic in angles_topics(specs, parameters_for(specs, None)))
 
@@ -318,8 +318,8 @@ def test_topics_have_known_types_and_publishers() -> None:
         assert topic.publisher in (*EXECUTABLES, "every node")
 
 
-# `launch` is not on PyPI: that the launch file runs is checked on a ROS install; here, that it compiles, that what it
-# takes from us is there, and that it repeats nothing of the table.
+# `launch` is not on PyPI, so a ROS install checks that the launch file runs. Here: it compiles, its imports from this
+# package exist, and it repeats nothing of the table.
 
 
 def test_the_launch_file_takes_its_nodes_from_the_table() -> None:

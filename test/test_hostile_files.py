@@ -74,7 +74,7 @@ READERS = (calibration, parameters, robot, listing)
 
 
 def refused_soon(path: Path, read: Callable[[Path], object]) -> str:
-    """The line in which a file is refused, within the limits."""
+    """The error line for a refused file, within the limits of time and memory."""
     before, begin = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
     with pytest.raises(BodyTrackingError) as caught:
         read(path)
@@ -94,7 +94,7 @@ def test_hostile_yaml_is_refused_in_one_line(tmp_path: Path, content: str, read:
     harmless = ("a day that is none", "an object", "a key that is a list", "no text", "mappings in each other, line")
     if read is listing and content.startswith(harmless):
         try:
-            reader = listing(path)  # a listing that is no YAML is only damaged: the files tell what it would
+            reader = listing(path)  # an invalid listing is only damage: its content follows from the files
         except BagError as error:
             assert "nested deeper" in str(error)
             return

@@ -1,4 +1,4 @@
-"""What is imported, and so how soon something starts: heavy libraries only where they are used."""
+"""Imports, which determine how soon a process starts: heavy libraries only where they are used."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""What the live graph publishes is what ``replay`` writes: every topic, for every filter and shipped recording.
+"""The live graph publishes the messages that ``replay`` writes: every topic, for every filter and shipped recording.
 
-Knows no node: what the two have in common is compared, whatever publishes it.
+The comparison knows no nodes: all common topics are compared, whatever publishes them.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from test_up import Up
 ROOT = Path(__file__).resolve().parent.parent
 BAGS = ROOT / "bags"
 MARKERS, SETUP = "markers_arm", ROOT / "config" / "marker_setup"
-"""The recording of image pairs, and what tracks the markers in it."""
+"""The recording of image pairs, and the setup that tracks its markers."""
 MESH = "mesh_reaching"
 """The recording of depth images."""
 CAMERA = "camera_reaching"
@@ -59,27 +59,27 @@ CAMERAS = "cameras_turning"
 """The recording of two colour cameras."""
 SMOOTHED = "wave with a lag"
 SAME = 1e-4
-"""Metres, radians and the like by which live and offline may differ: far less than anything is known to. They are equal
-to the last bit while both have the same number of BLAS threads; with another number sums round differently (4e-5)."""
+"""Largest difference of live and offline, in metres, radians and other units: far less than any accuracy. They are
+equal to the last bit with the same number of BLAS threads; with another number sums round differently (4e-5)."""
 PATIENT = {"activation_delay": 2.0, "max_wait": 1.0, "order_wait": 1.0, "predict_after": 1000.0}
-"""On a machine with much else to do messages get lost and are sent again: a node may lag behind by so much and gives
-the same as offline."""
+"""Waiting times for a busy machine, on which messages get lost and are resent: a node that lags by less gives the
+offline results."""
 OF_NODES = {
     "calibration": ("activation_delay",),
     "fusion": ("max_wait",),
     "skeleton_filter": ("order_wait", "predict_after"),
 }
-"""Whose parameters these are."""
+"""The nodes to which these parameters belong."""
 LATE = re.compile(r"late( ticks| frames)?|missed|lost .+|late_frames")
 """Counters of a node that say that a message came too late for its results to be those of an offline run."""
 LATEST_S = 10.0
-"""From capture to the log on a machine with much else to do; the sensors' own clocks are minutes and years away."""
+"""Longest time from capture to the log on a busy machine; the sensors' own clocks are minutes and years away."""
 TICK_S = 0.05
-"""Of ``/clock``: the recorder may have received one tick less than the publisher of a stamp."""
+"""Period of ``/clock``: the recorder may have received one tick less than the publisher of a stamp."""
 HOLD_FROM_S = PATIENT["activation_delay"] + TICK_S
 """Calibration is stamped with the time from which on it holds."""
 OTHERS = {graph.DIAGNOSTICS_TOPIC, graph.CLOCK_TOPIC, mesh_topic("kinect1")}
-"""A node's own figures, the clock of a bag, and what is published only while there is a subscriber."""
+"""Topics that are not compared: a node's own figures, the clock of a bag, and a topic that needs a subscriber."""
 
 
 def parameters(folder: Path, **more: object) -> Path:
@@ -121,7 +121,7 @@ def published(bag: Path, without: set[str]) -> dict[str, dict[int, list[list[flo
 
 
 def differences(live: Path, offline: Path, without: set[str], share: float = 0.0, within: float = SAME) -> list[str]:
-    """Where the messages of two recordings are not the same in more than this share of a topic; empty for nowhere."""
+    """Topics of two recordings of which more than this share of the messages differ, a line each."""
     one, other = published(live, without), published(offline, without)
     assert one.keys() & other.keys(), (one.keys(), other.keys())
     found = [f"{topic}: not live" for topic in other.keys() - one.keys()]
@@ -143,7 +143,7 @@ def differences(live: Path, offline: Path, without: set[str], share: float = 0.0
 
 
 def late_messages(bag: Path) -> list[str]:
-    """What the diagnostics in a recording say of messages that came too late, or not at all."""
+    """The counters of late and lost messages in a recording's diagnostics."""
     found: dict[str, str] = {}
     with RigReader(bag) as reader:
         kind = reader.topics[graph.DIAGNOSTICS_TOPIC].type_name
@@ -173,8 +173,8 @@ def live_as_offline(
 ) -> Path:
     """The live graph's recording of a bag, which is that in ``offline`` but for some topics.
 
-    A graph that says that messages came too late plays the bag once more, and slower; one that differs without saying
-    so is wrong.
+    If a graph reports that messages came too late, the bag is played once more, and slower; a difference without such
+    a report is an error.
     """
     said: list[object] = []
     for rate in ("1", "0.5", "0.25"):
@@ -249,7 +249,7 @@ def test_a_recording_gives_the_same_live_and_offline(
 
 
 def test_every_stamp_of_a_live_graph_is_in_the_time_of_its_clock(played: Callable[[str, str], Path]) -> None:
-    """So that all of them can be compared with ``/clock``, though the sensors have clocks of their own."""
+    """All stamps can be compared with ``/clock``, though the sensors have clocks of their own."""
     found: dict[str, list[float]] = {}
     poses: list[int] = []
     shown: list[int] = []

@@ -1,4 +1,4 @@
-"""The noise model knows the sensor's weaknesses, and the body's heading does not depend on where the sensor stands."""
+"""The noise model has the sensor's known weaknesses, and the body's heading does not depend on the sensor's place."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_a_sensor_that_states_covariances_is_taken_at_its_word() -> None:
     unknown = [Joint.HEAD, Joint.HAND_LEFT]
     assert np.isinf(variance[unknown]).all()
     assert_allclose(np.delete(variance, unknown), (0.05**2 + 0.06**2 + 0.2**2) / 3.0)
-    # but not below the errors of which the correlation is known
+    # but not below the errors for which the correlation is known
     smaller = joint_variance(AT_TWO_METRES, states, 0.01 * covariances)
     assert_allclose(np.delete(smaller, unknown), np.delete(BASE_STDDEV**2, unknown))
 
@@ -82,7 +82,7 @@ def test_errors_of_joints_are_correlated_less_with_each_bone_between_them(of_bon
     correlation = joint_correlation(of_bones)
     bones = np.full((N_JOINTS, N_JOINTS), np.inf)
     np.fill_diagonal(bones, 0.0)
-    for parent, child in BONES:  # from the base outwards: a child is as far from all before it as its parent, and one
+    for parent, child in BONES:  # from the base outwards: a child is one bone farther from all others than its parent
         bones[child] = np.minimum(bones[child], bones[parent] + 1.0)
         bones[:, child] = bones[child]
     assert_allclose(correlation, of_bones**bones, atol=1e-9)

@@ -1,4 +1,4 @@
-"""Messages there and back, in both families of classes; what does not go together is refused by name."""
+"""Round trips of messages, in both families of classes; inconsistent ones are refused by name."""
 
 from __future__ import annotations
 

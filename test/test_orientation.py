@@ -1,4 +1,4 @@
-"""One orientation of one segment: what is none is refused with a clear text."""
+"""One orientation of one segment: invalid ones are refused with a clear text."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The package as others get it: built by colcon, as a wheel, and through make."""
+"""The package as installed: built by colcon, as a wheel, and through make."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parent.parent
 SHARED_FOLDERS = ("config", "launch", "rviz", "foxglove", "bags")
 
 # import name -> (distribution, rosdep key); None where rosdistro has no key that fits and README.md gives the pip line.
-# What is not here is a ROS package, declared under its own name.
+# All other imports are ROS packages, declared under their own names.
 LIBRARIES = {
     "numpy": ("numpy", "python3-numpy"),
     "scipy": ("scipy", "python3-scipy"),
@@ -42,7 +42,7 @@ LIBRARIES = {
     "rosbags": ("rosbags", None),
 }
 EXTRAS = {"ai_edge_litert": "camera", "viser": "viewer", "trimesh": "viewer", "websockets": "viewer"}
-"""Import name -> extra; who imports these says what to install where they are absent."""
+"""Import name -> extra; modules that import these name the extra where it is absent."""
 
 
 def run(*command: str | Path, cwd: Path, env: dict[str, str] | None = None) -> subprocess.CompletedProcess[str]:

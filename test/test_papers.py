@@ -1,4 +1,4 @@
-"""``docs/papers.md`` leaves nothing out of the papers, and what it names is there and says which equation it is."""
+"""``docs/papers.md`` covers everything in the papers; its names exist, and their docstrings cite the equations."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ NUMBERED = {
     "figures 1.1-1.4, 2.1-2.2, 3.1-3.5, 4.1-4.4, 5.1-5.9, 6.1-6.4, 7.1",
     "jatesiktat2018": "eq. 1-19; figures 1-5",
 }
-"""All that has a number in each paper, and so has to be on the page."""
+"""All numbered items of each paper, which have to be on the page."""
 
 _NUMBER = r"(?:[A-E]\.\d+|[IVX]+(?:-[A-J])?|\d+(?:\.\d+)*)"
 _ITEM = rf"{_NUMBER}(?:-{_NUMBER})?"

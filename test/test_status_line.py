@@ -17,7 +17,7 @@ def test_the_status_line_names_a_calibration_only_where_there_is_something_to_ca
 
 
 def test_problems_are_named_by_their_nodes() -> None:
-    """``up`` says them while no angles come, and at its end where none came."""
+    """``up`` prints them while no angles come, and at its end if none came."""
     found = {
         "imu_skeleton": NodeStatus("imu_skeleton: state", 1, "forearm_left: not aligned"),
         "calibration": NodeStatus("calibration: state", 1, "waiting for a still pose"),

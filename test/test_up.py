@@ -1,4 +1,4 @@
-"""``body_tracking up`` as its user meets it: the real graph over a shipped recording, killed in every place."""
+"""``body_tracking up`` as a process: the real graph over a shipped recording, with each of its processes killed."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ NODES = ("joint_angles", "skeleton_filter", "fusion", "calibration", "bag_record
 
 
 class Up:
-    """A running ``body_tracking up``, and an ear for its angles."""
+    """A running ``body_tracking up``, and a subscriber of its angles."""
 
     def __init__(self, folder: Path, *arguments: str | Path) -> None:
         number = domain()
@@ -122,7 +122,7 @@ def angles_in(path: Path, topic: str) -> dict[int, Any]:
 
 
 def contention() -> float:
-    """How many times longer than alone a start takes now, because other processes use the processors; at least 1."""
+    """Factor, at least 1, by which a start takes longer now because other processes use the processors."""
 
     def used() -> float:
         ended = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -206,7 +206,7 @@ def test_an_up_that_was_killed_with_all_its_nodes_is_back_when_it_is_started_aga
     psutil.wait_procs(list(nodes), timeout=5.0)
     graph_up.start()
     graph_up.received.clear()
-    # what is left of it counts neither as a first ``up`` nor as a second publisher
+    # its remains in DDS count neither as a first ``up`` nor as a second publisher
     assert graph_up.until(lambda: len(graph_up.received) > 60, timeout=120.0), graph_up.text()
     assert not re.search("another body_tracking up|publishers", graph_up.text()), graph_up.text()
 
@@ -312,7 +312,7 @@ def test_up_without_arguments_takes_the_sensors_that_publish(
 
 
 def angles_of(parameters: dict[str, dict[str, Any]], options: Options) -> tuple[str, str]:
-    """What ``joint_angles`` makes angles of with these parameters, and in which convention."""
+    """The input and the convention of ``joint_angles`` with these parameters."""
     given = parameters["joint_angles"]
     published = ROLES[options["filter"]].angles_input if options["filter"] else graph.SKELETON_INPUT
     source = given.get("input", graph.AUTO)

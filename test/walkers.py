@@ -1,6 +1,6 @@
-"""What people do, and one who walks about, seen by sensors without noise or with some: for tests of all that follows.
+"""Performed motions, and a walking person, seen by sensors with or without noise.
 
-The errors that make calibration hard are put in one at a time by the tests themselves.
+The tests themselves add the errors that make calibration hard, one at a time.
 """
 
 from __future__ import annotations

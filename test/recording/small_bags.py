@@ -61,7 +61,7 @@ COMPRESSION = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none":
 
 
 def write(folder: Path, stored: Sequence[Stored], compression: str = "zstd", **options: Any) -> Path:
-    """A closed bag; the path of its file. ``ros2 bag`` can be told to compress otherwise than we do."""
+    """Write a closed bag; returns the path of its file. Other compressions are those of ``ros2 bag``."""
     with (
         patch.object(rosbag2, "Writer", partial(Writer, compression=COMPRESSION[compression])),
         BagWriter(folder, **options) as writer,

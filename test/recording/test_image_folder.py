@@ -1,4 +1,4 @@
-"""Folders of images as bags: what is in the files is in the bag, and bad files are named."""
+"""Folders of images as bags: the bag holds the files' contents, and bad files are named."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ def test_the_mesh_is_drawn_where_it_is_seen_and_leaves_the_rest_as_it_was() -> N
     person = render(corners.reshape(-1, 3), np.arange(corners.size // 3).reshape(-1, 3), CAMERA).depth > 0.0
     drawn, plain = overlay(depth, corners, CAMERA), overlay(depth, corners[:0], CAMERA)
     assert np.array_equal(drawn[~person], plain[~person])
-    # of skin: more red than blue, where the image is grey
+    # the colour of skin: more red than blue; the image itself is grey
     assert (drawn[person][:, 0] > drawn[person][:, 2]).all() and (plain[..., 0] == plain[..., 2]).all()
 
 

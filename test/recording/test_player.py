@@ -1,4 +1,4 @@
-"""The timing of playback, against a clock that the test turns."""
+"""The timing of playback, with a clock that the test advances."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def reader(tmp_path_factory: pytest.TempPathFactory, stored: list[Stored]) -> It
 
 
 class Run:
-    """Calls a playback when it asks for it, plus a delay, and notes what came when."""
+    """Calls a playback when it asks for it, plus a delay, and records the times of the messages."""
 
     def __init__(self, playback: Playback, delays: Iterator[int] | None = None) -> None:
         self.playback = playback
@@ -84,7 +84,7 @@ def test_everything_comes_in_order_never_early_and_the_clock_with_it(reader, sto
         assert (at_ns - NOW) * rate >= (log_time_ns - stored[0][2]) - 10 * rate
     times = [clock_ns for _, clock_ns in run.clock]
     assert times == sorted(times) and times[-1] == stored[-1][2]
-    # What the clock says is never ahead of what is still to come.
+    # The clock is never ahead of the remaining messages.
     for (at_ns, clock_ns), following in zip(run.clock, run.clock[1:], strict=False):
         assert clock_ns <= following[1] and at_ns <= following[0]
 
@@ -130,7 +130,7 @@ def test_a_pause_delays_later_messages_by_its_length(reader, stored, begin, leng
 @settings(max_examples=draws(12, 30), deadline=None)
 @given(st.integers(0, SECOND), st.integers(0, SECOND // 5), st.floats(0.2, 20.0))
 def test_the_clock_never_runs_ahead_of_messages_that_a_pause_finds_due(reader, stored, begin, late, rate):
-    """As where the process was busy: messages were due, but not sent, when somebody paused."""
+    """As when the process is busy: messages were due, but not sent, at the pause."""
     run = Run(Playback(reader))
     run.until(NOW + begin)
     now = NOW + begin + late

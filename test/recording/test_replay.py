@@ -1,4 +1,4 @@
-"""The offline graph: deterministic, the same in one process and in two, and clear about bags that it cannot use."""
+"""The offline graph: deterministic, equal in one process and in two, with clear errors for unusable bags."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def test_one_process_and_several_give_the_same_messages_each_time(
 
 
 class Owner:
-    """In a cycle, as ROS nodes are; notes the process that takes it down."""
+    """An object in a reference cycle, as ROS nodes are; records the process that destroys it."""
 
     def __init__(self, notes: Path) -> None:
         self._notes, self._own = notes, self
@@ -161,7 +161,7 @@ def job(out: Path, **settings: str) -> forked.Job:
 def test_the_end_of_the_other_process_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Ending(Downstream):
         def take(self, topic: str, cdr: bytes, log_time_ns: int) -> None:
-            time.sleep(0.2)  # until more has come, which stays unread
+            time.sleep(0.2)  # until more messages have come, which stay unread
             os._exit(7)
 
     monkeypatch.setattr(forked, "Downstream", Ending)
@@ -187,7 +187,7 @@ def test_the_extended_filter_publishes_its_whole_state(extended_wave: Path, repl
     assert 1 <= counts[graph.urdf_topic("body1")] <= 1 + seconds(wave)  # at most once a second
     assert tuple(first.name) == tuple(f"{name}_body1" for name in convention("model", UpperBody()).names)
     assert first.header.frame_id == "model"
-    # Two sensors out of step, each frame at its own time: more than the reference sensor has, and in order.
+    # Two sensors out of step, with an output for each frame at its own time: more than the reference has, and in order.
     stamps = np.array([each.stamp_ns for each in frames])
     assert (np.diff(stamps) > 0).all()
 
@@ -239,14 +239,14 @@ def test_where_all_sensors_fall_silent_the_extended_filter_predicts(tmp_path: Pa
     assert 26 <= len(predicted) <= 29
     assert report.counters["filter predicted frames"] == len(predicted)
     spread = [np.trace(each.covariances, axis1=1, axis2=2)[Joint.HAND_LEFT] for each in predicted]
-    # Half a second long the deviation grows; then the posture prior, linearised at an ever vaguer pose, moves it about.
+    # For half a second the deviation grows; then the posture prior, linearised at an uncertain pose, makes it vary.
     soon, later = spread[:15], spread[15:]
     assert (np.diff(soon) > 0.0).all()
     assert min(later) > soon[-1]
 
 
 def elbows(bag_path: Path) -> tuple[FloatArray, FloatArray]:
-    """(2, n) radians: flexion of the elbows as it was found, NaN where it is not known, and as it was in truth."""
+    """(2, n) radians each: estimated flexion of the elbows, NaN where unknown, and the true one."""
     with BagReader(bag_path) as bag:
         angles = [deserialize(JOINT_STATE, raw.cdr) for raw in bag.messages([ANGLES])][90:]
         truth = [deserialize(JOINT_STATE, raw.cdr) for raw in bag.messages([graph.TRUE_ANGLES])]
@@ -261,7 +261,7 @@ def elbows(bag_path: Path) -> tuple[FloatArray, FloatArray]:
 
 
 def test_the_angles_follow_the_truth(replayed_wave: Path, tmp_path: Path) -> None:
-    """Exactly where sensors only lose frames and their clocks differ; up and down with it where they err as they do."""
+    """Exactly if sensors only lose frames and have different clocks; correlated with it if they err as usual."""
     errors = KinectErrors()
     clean = replace(KinectErrors.none(), white=errors.white, lost=errors.lost, delay=errors.delay)
     write_bag(simulate(Setup("two_handed_wave", seconds=9.0, standard=True, errors=clean)), tmp_path / "clean")
@@ -330,7 +330,7 @@ def test_the_summary_of_a_replay_has_poses_and_known_angles(replayed_wave: Path,
         re.search(r"[1-9] of \d angles with a standard deviation below 30 deg, in \d+ % of the frames; median \d", line)
         for line in lines[2:]
     )
-    # the prior's deviation is no knowledge
+    # an angle with the prior's deviation counts as unknown
     assert any("; not left" in line for line in summary(extended_wave))
 
 
@@ -509,7 +509,7 @@ def test_sensors_none_leaves_out_the_skeletons_of_a_bag(tmp_path: Path, command:
 
 
 def test_inertial_sensors_without_a_pose_are_named(tmp_path: Path, command: Command) -> None:
-    """What a stage says of itself is the reason, not the counters of what it left out."""
+    """The stage's own status is the reported reason, not the counters of dropped messages."""
     readings = "".join(f"{k / 50},{k % 7},0.3,0.1,0,0,9.81\n" for k in range(200))
     header = "stamp,angular_velocity_x,angular_velocity_y,angular_velocity_z"
     (tmp_path / "a.csv").write_text(

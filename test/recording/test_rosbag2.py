@@ -70,7 +70,7 @@ def test_messages_are_read_in_the_order_of_log_times(drawn, compression, chunk_b
                 assert topic.count == sum(item[0] == name for item in stored)
             if stored:
                 assert (reader.start_ns, reader.end_ns) == (expected[0][2], expected[-1][2])
-        # The order among equal times is a matter of taste; everything else is not.
+        # Only the order among equal times is arbitrary.
         assert sorted(rosbags_read(Path(folder) / "bag")) == sorted(stored)
 
 
@@ -295,7 +295,7 @@ def test_a_folder_without_readable_metadata_is_read(tmp_path, text):
 
 
 def offsets(size: int) -> list[int]:
-    """Offsets close to each other near the ends, where everything happens in a few bytes, and many in between."""
+    """Dense offsets near both ends, where records are short, and many in between."""
     near_start, between, near_end = draws(5, 2), draws(61, 23), draws(7, 3)
     return sorted(
         {*range(1, 120, near_start), *range(120, size, between), *range(max(0, size - 300), size, near_end), size - 1}
@@ -459,7 +459,7 @@ def test_a_folder_that_is_no_bag_is_never_touched(tmp_path, option):
     [{"compression_mode": "MESSAGE"}, {"storage_identifier": "sqlite3", "relative_file_paths": ["bag_0.db3"]}],
 )
 def test_what_only_the_metadata_says_of_a_bag_is_not_overwritten(tmp_path, changed):
-    """Without them ``ros2 bag`` would take compressed messages for whole ones."""
+    """Without this metadata ``ros2 bag`` would read compressed messages as uncompressed ones."""
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         writer.add_connection("/text", "std_msgs/msg/String", typestore=TYPES)
     metadata = tmp_path / "bag" / "metadata.yaml"

@@ -1,4 +1,4 @@
-"""A recording in place of a sensor: frames at their time, in step, again from where it should be."""
+"""A recording in place of a sensor: frames come at their time, in step, and at the right position after a restart."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_frames_are_due_when_they_were_received_then() -> None:
         captured, received = (start + time_ns / NANOSECONDS for time_ns in times_in_bag(name)[0])
         assert stamp_ns / NANOSECONDS == pytest.approx(captured, abs=1e-5)
         assert received_ns / NANOSECONDS == pytest.approx(received, abs=1e-5)
-        # Never early; how late is the machine's affair.
+        # Never early; the delay depends on the machine.
         assert time.time() >= received - 1e-3
 
 
@@ -114,7 +114,7 @@ def test_real_recordings_play(shared_data: Path) -> None:
 
 
 def test_frames_of_a_file_with_another_clock_are_stamped_as_captured_now(tmp_path: Path) -> None:
-    """By the same rule as those of a bag: the quickest frame is captured when it plays, the others before that."""
+    """As with a bag: the stamp of the quickest frame is the time at which it plays, those of others are earlier."""
     columns = [f"{joint}_{axis}" for joint in JOINT_NAMES for axis in "xyz"]
     late = [0.02, 0.0, 0.05, 0.01, 0.0, 0.03]
     rows = [

@@ -23,7 +23,7 @@ EPOCH_NS = 1_750_000_000 * NANOSECONDS
 LEAST_S = 0.02
 KINECT = graph.skeleton_topic("kinect1")
 HELD = {graph.CALIBRATION, graph.CALIBRATION_CLOCK, "/tf_static"}
-"""Stamped with the time from which on they hold."""
+"""Topics whose stamps are the times from which the messages hold."""
 
 
 def nanoseconds(seconds: FloatArray) -> IntArray:
@@ -31,7 +31,7 @@ def nanoseconds(seconds: FloatArray) -> IntArray:
 
 
 def captured(n: int, seed: int = 0) -> tuple[FloatArray, FloatArray]:
-    """(n,) seconds of capture and of receipt, 30 times a second, with delays as a busy network has them."""
+    """(n,) seconds of capture and of receipt, at 30 Hz, with the delays of a busy network."""
     times = np.arange(n) / 30.0
     return times, times + LEAST_S + np.random.default_rng(seed).exponential(0.003, n)
 
@@ -169,7 +169,7 @@ def test_the_truth_keeps_its_distance_to_the_sensors_of_a_shipped_bag(name: str)
         assert np.ptp(np.concatenate(list(shift.values()))) < 100_000  # nanoseconds, by drift
         for raw in rig.messages([graph.TRUE_CLOCK]):
             _, _, clock = time_reference_to_clock(deserialize(TIME_REFERENCE, raw.cdr))
-            assert abs(clock.offset) < 1e-3  # what the two least delays differ by, in place of a second
+            assert abs(clock.offset) < 1e-3  # the difference of the two least delays, instead of a second
 
 
 def test_every_stamp_of_a_replay_is_in_ros_time(replayed_wave: Path) -> None:

@@ -39,7 +39,7 @@ def content(**safety: Any) -> dict[str, Any]:
 
 
 def mapping(made: dict[str, Any] | None = None) -> RobotMapping:
-    """Of some content."""
+    """A mapping with this content."""
     return parse(content() if made is None else made, ANGLES)
 
 

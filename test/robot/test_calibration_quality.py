@@ -13,7 +13,7 @@ from body_tracking.robot.calibration import CalibrationQuality
 
 
 def reported(calibration: OnlineCalibration) -> dict[str, str]:
-    """The values as they come in a message."""
+    """The diagnostic values, as strings like in a message."""
     return {key: str(value) for key, value in calibration.status()[2].items()}
 
 

@@ -45,9 +45,9 @@ class Bench:
         safety: thresholds.
 
     Attributes:
-        order: places of the angles in a message.
-        frames: of the sensors, so many per command.
-        stands: where the robot stands; None where it stands at its command, silent if mute.
+        order: permutation of the angles in a message.
+        frames: frames of the sensors per command.
+        stands: position of the robot; None if it is at its command. With ``mute`` it reports none.
     """
 
     def __init__(self, *follower: Any, state_topic: str = "", alone: bool = False, **safety: Any) -> None:
@@ -91,7 +91,7 @@ class Bench:
         self.follower.receive_angles(angles, convention, self.now_ns, self.steady_ns)
 
     def run(self, seconds: float = PERIOD) -> Command:
-        """Go on for some time; the last command."""
+        """Run for some time; returns the last command."""
         for _ in range(round(seconds / PERIOD)):
             self.elapsed_ns += PERIOD_NS
             self.frame += self.frames
@@ -220,7 +220,7 @@ WITHIN = {
     "silent calibration": 5.1,
     "silent robot": 0.55,
 }
-"""Seconds within which the robot holds; others: a message of a sensor that sees 30 times a second, and a command."""
+"""Seconds within which the robot holds; for all other faults: one frame of a sensor at 30 Hz, and one command."""
 
 
 @pytest.mark.parametrize("kind", FAULTS)
@@ -415,7 +415,7 @@ def test_joint_states_that_are_none_are_refused_and_not_followed(
 
 
 def test_while_the_robot_stands_still_its_command_stays_near_by_default() -> None:
-    """Kept by an emergency stop and moved by hand, whatever the person does; and then let go."""
+    """Held by an emergency stop and moved by hand, whatever the person does; then released."""
     bench = Bench(state_topic=STATE_TOPIC)
     allowed, rate = bench.follower.mapping.safety.max_tracking_error, bench.follower.mapping.rate
     assert allowed < 0.5
@@ -434,7 +434,7 @@ def test_while_the_robot_stands_still_its_command_stays_near_by_default() -> Non
             if before in (State.STOPPED, State.HOLDING) and command.state == State.APPROACHING:
                 begun += 1
                 assert (lead <= rate * PERIOD).all()
-            if step >= 2400:  # let go: a robot that is 0.05 s late
+            if step >= 2400:  # released: a robot that lags by 0.05 s
                 stands = stands + (command.position - stands) * PERIOD / 0.05
         if 1200 < step < 1800:
             stands = np.clip(stands + rng.normal(0.0, 0.02, 2), [-1.0, 0.0], [2.5, 2.0])
@@ -530,7 +530,7 @@ def test_commands_are_within_limits_for_any_sequence_of_events(events: list[Any]
             assert (command.position is None) == (command.state == State.STOPPED)
             if command.position is not None:
                 assert ((command.position >= robot.lower) & (command.position <= robot.upper)).all()
-                # also over a pause without commands: where it stopped it goes on
+                # also over a pause without commands: it continues where it stopped
                 elapsed = (steady_ns - last_ns) / NANOSECONDS
                 assert (np.abs(command.position - last) <= robot.rate * elapsed + 1e-9).all()
                 if state == command.state == State.HOLDING:

@@ -32,7 +32,7 @@ def test_a_joint_is_scale_times_angle_plus_offset() -> None:
     assert found.angles == ("shoulder_elevation_left", "elbow_flexion_left")
     np.testing.assert_allclose(found.matrix, [[-0.5, 0.0], [-0.5, 2.0]])
     np.testing.assert_allclose(found.offset, [1.0, 0.0])
-    # half of a whole turn means the same for the first; the sum's terms have no period in common
+    # the first joint has a period of half a turn; the sum's terms have no common period
     np.testing.assert_allclose(found.period, [np.pi, 0.0])
     np.testing.assert_array_equal(found.acceleration, [20.0, np.inf])
     np.testing.assert_allclose(found.max_stddev, 0.4)

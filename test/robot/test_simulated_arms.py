@@ -25,7 +25,7 @@ FORWARD, LEFT, DOWN = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), np.a
 
 
 def arm_of(robot: str) -> tuple[RobotMapping, SimulatedArm]:
-    """A mapping, and the arm that it is about."""
+    """A mapping and its arm."""
     mapping = load(ROOT / "config" / "robots" / f"{robot}.yaml", NAMES)
     return mapping, SimulatedArm(ROOT / "examples" / "robot_arms" / f"{robot}.xml", mapping.joints, mapping.home)
 

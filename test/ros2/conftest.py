@@ -18,14 +18,14 @@ SETUP = HERE.parents[1] / ".ros2_workspace" / "setup.sh"
 ABSENT = 77
 """Exit code of ``workspace`` where the sources of ``ros2`` are not there."""
 PROCESSOR = ("OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES", "NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES")
-"""By which another processor is emulated; compiled code is kept for each."""
+"""Variables that emulate another processor; compiled code is kept for each."""
 OWN = ("HOME", "LANG", "PATH", "TMPDIR", "XDG_CACHE_HOME", *PROCESSOR)
-"""All that a terminal in which the workspace is sourced takes over from the tests."""
+"""All variables that a terminal with the sourced workspace inherits from the tests."""
 
 
 @pytest.fixture(scope="session")
 def workspace() -> dict[str, str]:
-    """The environment of such a terminal; what has changed since ``make ros2-workspace`` is built first."""
+    """The environment of such a terminal; changes since ``make ros2-workspace`` are built first."""
     if os.environ.get("TEST_ROS2") == "failed":
         pytest.skip("the workspace could not be made, by which make fails; test/ros2/workspace says why")
     made = subprocess.run([HERE / "workspace"], capture_output=True, text=True, check=False)

@@ -20,18 +20,18 @@ CTRL_C = b"\x03"
 IN_TERMINAL = (
     "import fcntl, os, sys, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); os.execvp(sys.argv[1], sys.argv[1:])"
 )
-"""Makes the standard input the terminal by which the session is controlled, as a shell has it."""
+"""Makes the standard input the controlling terminal of the session, as a shell does."""
 MOMENTS = (0.3, 0.5, 0.8, 1.1, 1.4, 1.8, 2.4, 3.5, 5.0, 8.0)
 """Seconds from the start of the last process, while nodes import, find each other and work.
 
-Sooner is launch's own affair: while it starts processes, one that a signal ends before launch has noted its start
-leaves launch waiting for ever, whatever process that is (osrf_pycommon is told of the end before the beginning).
+Earlier, launch itself has a defect: a process that a signal ends before launch has noted its start leaves launch
+waiting for ever, whatever process that is (osrf_pycommon is told of the end before the beginning).
 """
 STARTED = b"[bag_player-7]: process started"
 
 
 def until(terminal: int, printed: list[bytes], seconds: float, text: bytes | None = None) -> bool:
-    """Read what is printed, for so long or until a text is there; whether the terminal is still open."""
+    """Read the output for some seconds or until a text comes; returns whether the terminal is still open."""
     end = time.monotonic() + seconds
     while (text is None or text not in b"".join(printed)) and (left := end - time.monotonic()) > 0.0:
         if select.select([terminal], [], [], left)[0]:

@@ -1,4 +1,4 @@
-"""``ros2 launch`` as README.md says it."""
+"""``ros2 launch`` as in README.md."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_a_recording_becomes_angles_and_filter_and_convention_may_change_meanwhi
     launch = tools.launch(f"bag:={tools.bag('tpose_torso_twist')}", "record:=live", "filter:=ekf", "rate:=0.2")
 
     def comes(convention: str) -> bool:
-        """From now on."""
+        """Whether angles of a convention come from now on."""
         angles.clear()
         return tools.bench.until(lambda: [each for each in angles if each.header.frame_id == convention], SOON)
 
@@ -142,7 +142,7 @@ def test_wrong_values_end_the_launch_in_one_line(tools: Tools) -> None:
 
 
 def test_node_that_refuses_its_parameters_ends_the_launch(tools: Tools) -> None:
-    """Instead of starting the node again for ever."""
+    """The node is not restarted for ever."""
     (tools.folder / "calibration.yaml").write_text("[" * 10)
     launch = tools.launch(f"bag:={tools.bag()}", "calibration:=calibration.yaml")
     assert launch.ended() == 1, launch.text()

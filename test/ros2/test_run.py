@@ -47,7 +47,7 @@ class AllNodes:
         }
 
     def text(self) -> str:
-        """What they have printed."""
+        """The output of all nodes."""
         return "\n".join(f"{name}: {tool.text()}" for name, tool in self.tools_of.items())
 
 

@@ -17,7 +17,7 @@ from running import Running
 
 
 def members(session: int) -> list[psutil.Process]:
-    """What still runs of a terminal's session."""
+    """The processes of a terminal's session that still run."""
     found = []
     for process in psutil.process_iter():
         with contextlib.suppress(ProcessLookupError, psutil.Error):
@@ -27,7 +27,7 @@ def members(session: int) -> list[psutil.Process]:
 
 
 def kill(session: int) -> None:
-    """End all of it."""
+    """Kill all processes of a session."""
     for process in members(session):
         with contextlib.suppress(psutil.Error):
             process.kill()
@@ -37,7 +37,7 @@ class Tool:
     """A command that runs in a session of its own.
 
     Args:
-        command: what is typed.
+        command: with its arguments.
         log: file for all that it and its processes print.
         environment: of the terminal.
         folder: working directory.
@@ -61,7 +61,7 @@ class Tool:
         return self.log.read_text(encoding="utf-8")
 
     def ended(self, timeout: float = 60.0) -> int:
-        """Its exit code, at its end; nothing that it started runs on."""
+        """Wait for its end; returns the exit code. No process that it started may still run."""
         try:
             code = self.process.wait(timeout)
         except subprocess.TimeoutExpired as error:
@@ -78,11 +78,11 @@ class Tool:
 
 
 class Tools:
-    """``ros2``, and a node that looks on.
+    """``ros2``, and a node that observes.
 
     Args:
         environment: of a terminal in which the workspace is sourced.
-        folder: for what it writes; the working directory.
+        folder: the working directory, for all output.
     """
 
     def __init__(self, environment: Mapping[str, str], folder: Path) -> None:
@@ -126,10 +126,10 @@ class Tools:
         return self.start("run", "body_tracking", executable, *arguments, *(["--ros-args", *words] if words else []))
 
     def ask(self, wanted: str, *words: str | Path, timeout: float = 120.0) -> str:
-        """What a command prints, which is repeated until that contains something, as its user would.
+        """The output of a command, which is repeated until the output contains ``wanted``, as a user would.
 
-        On a busy machine it may look for a node too briefly, and a service may answer before it knows whom: DDS then
-        drops the response, and the command waits for it for ever.
+        On a busy machine the command may look for a node too briefly, and a service may respond before it has
+        discovered the client: DDS then drops the response, and the command waits for it for ever.
         """
         end, said = time.monotonic() + timeout, ""
         while time.monotonic() < end:
@@ -148,4 +148,4 @@ class Tools:
 
 
 NO_DAEMON = "--no-daemon"
-"""For commands of ``ros2`` that would start a process which stays."""
+"""Option of commands of ``ros2`` that would start a permanent process otherwise."""

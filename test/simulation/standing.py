@@ -1,4 +1,4 @@
-"""A person who stands: joints and flesh by hand, for tests of what sensors see."""
+"""A standing person: joints and flesh by hand, for tests of sensors' views."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def placed(body: FloatArray, position: FloatArray, yaw: FloatArray | float) -> F
 
 
 def flesh() -> Capsules:
-    """Of an ordinary person."""
+    """Capsules of an ordinary person."""
     parts = [
         ("HEAD", "HEAD", 0.1),
         ("SPINE_BASE", "SPINE_MID", 0.12),

@@ -258,7 +258,7 @@ def test_true_poses_and_clocks_take_the_measurements_to_the_truth(tmp_path: Path
     """Bring each sensor's joints into the world and its stamps into the reference clock: they meet the truth there."""
     write_bag(simulate(Setup("torso_twist", seconds=12.0, errors=KinectErrors.none())), tmp_path / "exact")
     for sensor in SENSORS:
-        # straight lines between frames: an eighth of the square of 1/30 s times an acceleration, here up to 40 m/s2
+        # interpolation between frames errs by up to an eighth of (1/30 s)^2 times an acceleration, here up to 40 m/s2
         assert errors_of(tmp_path / "exact", sensor).max() < 0.006
 
 

@@ -1,4 +1,4 @@
-"""Simulated inertial sensors: physics where they do not err, and data sheets where they do."""
+"""Simulated inertial sensors: exact physics without errors, and errors as in the data sheets."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def still(quat_xyzw: FloatArray | None = None, position: FloatArray | None = Non
 
 
 def turning(axis: FloatArray, angle: float, begin: float, duration: float) -> Motion:
-    """About the origin by an angle in a minimum-jerk move."""
+    """A rotation about the origin by an angle, as a minimum-jerk move."""
 
     def motion(times: FloatArray) -> tuple[FloatArray, FloatArray]:
         turn = angle * minimum_jerk((times - begin) / duration)[:, None] * axis
@@ -329,7 +329,7 @@ def test_misalignment_is_spread_as_stated() -> None:
 @given(SEEDS)
 @settings(max_examples=draws(4, 8), deadline=None)
 def test_at_rest_tissue_sags_by_its_parameter_in_any_pose(seed: int) -> None:
-    """And turns it by the sag across the limb over the radius."""
+    """The sag across the limb also rotates the sensor, by the sag over the limb's radius."""
     errors = replace(IDEAL, tissue_sag=0.001, tissue_turn=10.0)
     place, quat = np.array([0.0, 0.05, -0.1]), so3.exp(np.random.default_rng(seed).normal(size=3))
     samples = measured(still(quat), errors, duration=1.0, mounting=Mounting(place, AT_ORIGIN.quat_xyzw))
@@ -337,7 +337,7 @@ def test_at_rest_tissue_sags_by_its_parameter_in_any_pose(seed: int) -> None:
     sagged = samples.truth.positions - rotation @ place
     assert_allclose(
         sagged, np.tile(-0.001 * UP, (len(sagged), 1)), atol=1e-5
-    )  # a little of it is given up at the limit
+    )  # the limit of the displacement reduces it a little
     turn = so3.log(so3.quat_multiply(so3.quat_inverse(quat), samples.truth.quat_xyzw))
     expected = 10.0 * np.cross([0.0, 1.0, 0.0], rotation.T @ (-0.001 * UP))
     assert_allclose(turn, np.tile(expected, (len(turn), 1)), atol=1e-4)
@@ -689,7 +689,7 @@ def test_a_sensor_that_is_always_off_has_no_samples(oriented: bool) -> None:
 
 @pytest.mark.parametrize("segment", some(["hand_right", "upper_arm_left", "pelvis", "upper_trunk", "forearm_left"], 2))
 def test_on_a_person_the_mean_specific_force_is_gravity(segment: str) -> None:
-    """Of 20 s the mean specific force is gravity, whichever way the person moves, and tissue errs by some degrees."""
+    """Over 20 s the mean specific force is gravity for any motion; soft tissue changes it by some degrees."""
     rng = np.random.default_rng(4)
     person, movement = RandomPerson.draw(rng), RandomMotion(rng, 20.0)
 

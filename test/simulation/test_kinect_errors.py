@@ -30,10 +30,10 @@ from draws import draws
 
 POSE = level_pose("kinect1")
 PLACE = np.array([2.0, 0.0, -1.1])
-"""Of a person before the sensor; facing it at a yaw of pi."""
+"""Place of a person before the sensor, who faces it at a yaw of pi."""
 FLESH = flesh()
 THIN = Capsules(FLESH.starts[:1], FLESH.ends[:1], FLESH.radii[:1])
-"""A head alone: nothing else is hidden."""
+"""A head alone, which hides no other joint."""
 ERRORS = KinectErrors()
 NONE = KinectErrors.none()
 SPINE = [Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER, Joint.NECK, Joint.HEAD]
@@ -43,7 +43,7 @@ START = 1_700_000_000 * NANOSECONDS
 
 
 def only(**values: float) -> KinectErrors:
-    """Nothing errs but these."""
+    """Errors with only these parameters other than zero."""
     return KinectErrors(**{name: getattr(NONE, name) for name in NAMES} | values)
 
 
@@ -56,7 +56,7 @@ def see(
     rate: float = 30.0,
     capsules: Capsules = FLESH,
 ) -> tuple[FloatArray, NDArray[np.uint8]]:
-    """What a sensor makes of it."""
+    """The joints and states that a sensor reports."""
     times, rng = np.arange(len(truth)) / rate, np.random.default_rng(seed)
     return SimulatedKinect(pose, errors=errors).see(times, truth, capsules, rng, misreading or Misreading.draw(rng))
 
@@ -271,7 +271,7 @@ def test_shoulders_and_hips_seem_turned_less(yaw: float) -> None:
     positions, _ = see(only(turn_loss=0.3), still(0.1, np.pi + yaw), capsules=THIN)
     for left, right in ((Joint.SHOULDER_LEFT, Joint.SHOULDER_RIGHT), (Joint.HIP_LEFT, Joint.HIP_RIGHT)):
         axis = positions[0, left] - positions[0, right]
-        # who faces the sensor has the left side on the right of the picture
+        # the left side of a person who faces the sensor is on the right of the image
         seen = np.arctan2(abs(axis[2]), axis[0])
         assert seen == pytest.approx(yaw * (1.0 - 0.3 * np.sin(yaw) ** 4), abs=0.02)
 
@@ -431,7 +431,7 @@ def test_the_stated_share_of_frames_is_lost() -> None:
 def test_stalls_lose_the_frames_of_half_their_time() -> None:
     sensor = SimulatedKinect(POSE, errors=only(stall_rate=0.5, stall_time=0.2), dark=True)
     times, stamps, _ = frames_of(sensor, 400.0)
-    # now and then one falls into another
+    # some stalls overlap
     assert 1.0 - len(stamps) / len(times) == pytest.approx(0.5 * 0.5 * 0.2, abs=0.02)
 
 

@@ -1,4 +1,4 @@
-"""Whoever performs, and whatever: bones keep their lengths, angles their ranges, feet the floor, and nothing jerks."""
+"""For any person and motion: constant bone lengths, angles within ranges, feet on the floor, bounded jerk."""
 
 from __future__ import annotations
 
@@ -195,7 +195,7 @@ def test_any_instants_may_be_asked_for_in_any_order() -> None:
 
 
 def beats(signal: FloatArray) -> FloatArray:
-    """Sample numbers at which a signal rises through the middle of what it covers."""
+    """Sample numbers at which a signal rises through the middle of its range."""
     above = signal > 0.5 * (signal.max() + signal.min())
     return np.flatnonzero(above[1:] & ~above[:-1])
 

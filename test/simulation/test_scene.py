@@ -97,7 +97,7 @@ def test_the_truth_is_one_body_with_its_velocities() -> None:
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_velocities_are_whole_from_the_first_instant_on(seed: int) -> None:
-    """Whichever side of the start the first capture falls to."""
+    """Whether the first capture falls before or after the start."""
     truth = simulate(Setup("random", seconds=SHORT, seed=seed)).truths[0]
     assert_allclose(truth.velocities[0], truth.velocities[1], atol=0.05 + 0.2 * np.abs(truth.velocities[1]).max())
     assert np.abs(truth.rates[0]).max() > 0.5 * np.abs(truth.rates[1]).max()

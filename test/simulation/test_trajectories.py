@@ -1,4 +1,4 @@
-"""What motions are made of arrives where it should, at rest, and never jumps."""
+"""Parts of motions end at their targets, at rest, and without jumps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reduced curves of angles keep their extremes, and show what is unknown."""
+"""Reduced curves of angles keep their extremes, and show unknown stretches."""
 
 from __future__ import annotations
 

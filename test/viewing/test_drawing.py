@@ -1,4 +1,4 @@
-"""The viewer's drawing thread outlives a drawing that fails, and ends the node where all do; what of views is drawn."""
+"""The viewer's drawing thread survives a failed drawing and ends the node if all fail; age of the views' messages."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from body_tracking.nodes.viewer import ViewerNode
 
 
 class Drawing(SimpleNamespace):
-    """What ``keep_drawing`` has to do with; drawings of these numbers fail."""
+    """A stand-in for the node in ``keep_drawing``; drawings of these numbers fail."""
 
     def __init__(self, failing: range, until: int) -> None:
         super().__init__(

@@ -31,7 +31,7 @@ NOBODY = Seen((), stale=True)
 
 
 class Nobody:
-    """Takes what people press."""
+    """A target for the page's controls without effect."""
 
     def __getattr__(self, name: str) -> Any:
         return lambda *given: ""
@@ -64,7 +64,7 @@ def page(view: MarkerView) -> Iterator[Page]:
 
 
 def messages(scene: MarkerScene, index: int, brightness: int = 80) -> dict[str, bytes]:
-    """All that the nodes publish of one time; images are evenly bright, but for the balls."""
+    """All messages of the nodes for one time; images are evenly bright, but for the balls."""
     stamp_ns, found = START_NS + index * PERIOD_NS, {}
     points = scene.balls(index)
     for number, camera in enumerate(scene.rig.cameras):

@@ -30,7 +30,7 @@ OUTLINE = 240
 
 
 class Nobody:
-    """Takes what people press."""
+    """A target for the page's controls without effect."""
 
     def __getattr__(self, name: str) -> Any:
         return lambda *given: ""

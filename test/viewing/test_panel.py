@@ -1,4 +1,4 @@
-"""The control panel, without a browser: what it does with a choice while the nodes still report what ran before."""
+"""The control panel, without a browser: a user's choice is kept while the nodes still report the old value."""
 
 from __future__ import annotations
 
@@ -108,8 +108,8 @@ class Slider:
     """The slider of a panel at a real server, in which a user moves it; the bag has 15.4 s.
 
     Attributes:
-        sought: the places that the bag was sent to.
-        answer: the player's answer waits for it.
+        sought: positions to which the bag was asked to seek.
+        answer: event for which the player's answer waits.
     """
 
     def __init__(self, server: Any) -> None:
@@ -126,14 +126,14 @@ class Slider:
         return f"plays on from {place} s"
 
     def report(self, place: float, received: float | None = None) -> None:
-        """The player says where the bag is."""
+        """The player reports the bag's position."""
         values = {"duration s": "15.4", "position s": str(place), "loop": "False"}
         at = time.monotonic() if received is None else received
         self.panel.draw({"bag_player": NodeStatus("bag_player: bag", 0, "playing", values, at)}, at, False)
         self._in_loop(asyncio.sleep(0.0))
 
     def move(self, place: float) -> None:
-        """The browser says that the user moved it."""
+        """The browser reports that the user moved the slider."""
         message = importlib.import_module("viser._messages").GuiUpdateMessage(self.handle._impl.uuid, {"value": place})
         self._in_loop(self.server.gui._handle_gui_updates(1, message))
 
@@ -142,7 +142,7 @@ class Slider:
 
 
 def test_a_move_of_the_slider_is_not_undone_by_a_report_that_comes_before_it_is_read(server: Any) -> None:
-    """The server calls back in one of 32 threads. Here they are busy, as they may be while a page waits for answers."""
+    """The server's 32 threads for callbacks are busy here, as they may be while a page waits for answers."""
     slider, over = Slider(server), threading.Event()
     slider.answer.set()
     slider.report(2.0)
@@ -156,7 +156,7 @@ def test_a_move_of_the_slider_is_not_undone_by_a_report_that_comes_before_it_is_
 
 
 def test_the_slider_follows_the_bag_again_as_soon_as_it_is_there(server: Any) -> None:
-    """Held for longer, it would still be at 0.0 s when the user wants to go there once more: no move for a browser."""
+    """If held for longer, it would still be at 0.0 s when the user moves it there again: no change for a browser."""
     slider = Slider(server)
     slider.report(5.0)
     slider.move(0.0)

@@ -1,4 +1,4 @@
-"""Who may press the viewer's buttons: pages that it has served, and programs; no page of another site."""
+"""The viewer accepts its own pages and programs without an origin; it refuses pages of another site."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def port() -> Iterator[int]:
 
 
 def handshake(port: int, origin: str | None) -> int:
-    """The status that a websocket's handshake ends with."""
+    """The status of a websocket's handshake."""
     try:
         with connect(f"ws://127.0.0.1:{port}", origin=origin, subprotocols=["viser-v0"]):  # type: ignore[arg-type, list-item]
             return 101

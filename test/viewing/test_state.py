@@ -1,4 +1,4 @@
-"""The state of the graph in words: what plays, what records, what to do for the calibration, and that it has ended."""
+"""The state of the graph in words: the played bag, the recording, advice for the calibration, and the end."""
 
 from __future__ import annotations
 
