@@ -1,9 +1,9 @@
 """A simulated arm that follows a person: ``python examples/robot_arms/drive.py two_joint_arm --bag bags/tpose_wave``.
 
-Starts ``body_tracking up`` over a bag with the robot's mapping file, follows its commands in MuJoCo, and prints and
-draws what became of them. Without ``--bag`` only the arm runs, until Ctrl-C, for a graph that is started elsewhere:
-``body_tracking up --robot config/robots/two_joint_arm.yaml``. With ``--angles`` no graph runs: the bag holds its result
-already. Needs ROS, and ``pip install 'body_tracking[examples]'``.
+Starts ``body_tracking up`` over a bag with the robot's mapping file, follows the commands in MuJoCo, and prints and
+draws the resulting motion. Without ``--bag`` only the arm runs, until Ctrl-C, for a graph that is started elsewhere:
+``body_tracking up --robot config/robots/two_joint_arm.yaml``. With ``--angles`` no filter runs: the bag holds joint
+angles already. Needs ROS, and ``pip install 'body_tracking[examples]'``.
 """
 
 from __future__ import annotations
@@ -49,23 +49,23 @@ ROBOTS = HERE.parents[1] / "config" / "robots"
 RESTART = 4.0
 """Seconds after which a killed player is started again."""
 PERIOD = 0.01
-"""Seconds between two words of the robot's state."""
+"""Seconds between two messages with the robot's state."""
 COMPARED_DELAYS = np.arange(0.0, 0.3, 0.01)
-"""Seconds by which the joints may be behind the commands, to be told from errors of another kind."""
+"""Assumed delays of the joints behind the commands, seconds; the best one separates delay from other errors."""
 
 
 class Arm(Node):
-    """Takes commands, moves the arm in real time, and says how it stands.
+    """Takes commands, moves the arm in real time, and publishes its state.
 
     Attributes:
-        times: seconds, of each entry of the others.
-        told: (n,) the last command by then; NaN while there are none.
-        stood: (n,) how the joints stood.
-        points: (n + 1, 3) where they were.
-        commands: how many came.
-        first: steady time of the first of them; infinite before.
+        times: steady time of each entry of the next three, seconds.
+        told: (n,) radians: the last command; NaN while no commands come.
+        stood: (n,) radians: positions of the joints.
+        points: (n + 1, 3) metres: places of the joints and of the tip.
+        commands: number of received commands.
+        first: steady time of the first command; infinite before.
         played: seconds of the bag, by the player's diagnostics.
-        reason: what the diagnostics of ``robot_commands`` said last.
+        reason: text of the last diagnostics of ``robot_commands``.
         killed: steady time at which the player was killed; infinite if it was not.
     """
 
@@ -92,18 +92,18 @@ class Arm(Node):
         self.create_timer(PERIOD, self.advance, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def on_trajectory(self, message: JointTrajectory) -> None:
-        """A point, in the order that the message names."""
+        """Callback of a trajectory of one point, in the order of the message's joint names."""
         place = [message.joint_names.index(name) for name in self.mapping.joints]
         (point,) = message.points
         seconds = point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec
         self.go_to(np.array(point.positions)[place], seconds)
 
     def on_array(self, message: Float64MultiArray) -> None:
-        """Positions in the controller's order."""
+        """Callback of positions in the controller's order."""
         self.go_to(np.array(message.data), 0.0)
 
     def on_diagnostics(self, message: DiagnosticArray) -> None:
-        """Why there are commands, or none."""
+        """Note the player's position, and print why there are commands or none."""
         for status in statuses(message):
             if status.node == "bag_player":
                 self.played = status.number("position s") or 0.0
@@ -119,7 +119,7 @@ class Arm(Node):
         self.arm.go_to(position, seconds)
 
     def advance(self) -> None:
-        """Up to the present; what was missed for longer than a moment is left out."""
+        """Simulate up to the present, at most ten periods, and publish and record the state."""
         now = time.monotonic()
         self.arm.advance(min(now - self.passed, 10 * PERIOD))
         self.passed = now
@@ -134,7 +134,7 @@ class Arm(Node):
 
 
 def report(arm: Arm) -> str:
-    """How each joint followed its commands, as a table."""
+    """A table of how each joint followed its commands."""
     times, told, stood = np.array(arm.times), np.array(arm.told), np.array(arm.stood)
     lines = [f"{'joint':<10} {'from':>7} {'to':>7} {'rms error':>10} {'behind':>8}   (degrees, ms)"]
     for column, name in enumerate(arm.mapping.joints):
@@ -150,7 +150,7 @@ def report(arm: Arm) -> str:
 
 
 def draw(arm: Arm, path: Path) -> None:
-    """Commands and joints over time, and the arm at some instants."""
+    """Draw commands and joints over time, and the arm at some instants."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -193,12 +193,12 @@ def draw(arm: Arm, path: Path) -> None:
 
 
 class Graph:
-    """What commands the arm: ``body_tracking up`` over a bag, or, where the bag holds angles already, a player of them.
+    """The processes that command the arm: ``body_tracking up`` over a bag, or a player of a bag with joint angles.
 
     Args:
-        bag: what is played.
+        bag: to play.
         file: the robot's mapping.
-        filter_name: of the graph; empty where the bag holds angles.
+        filter_name: of the graph; empty if the bag holds angles.
     """
 
     def __init__(self, bag: Path, file: Path, filter_name: str) -> None:
@@ -236,7 +236,7 @@ class Graph:
         )
 
     def running(self) -> bool:
-        """Whether there is more to come; a player that was killed is started again after a while, as ``up`` does."""
+        """Whether the bag still plays; a killed player is restarted after ``RESTART``, as ``up`` does."""
         if self._main.poll() is None:
             return True
         if time.monotonic() > self._again:
@@ -246,7 +246,7 @@ class Graph:
         return np.isfinite(self._again)
 
     def kill(self, played: float) -> None:
-        """End the player as a crash does. Linux only."""
+        """Kill the player, ``played`` seconds into the bag, as a crash would. Linux only."""
         if not self._live:
             self._main.kill()
             self._again, self._played = time.monotonic() + RESTART, played
@@ -256,7 +256,7 @@ class Graph:
                 os.kill(int(child), signal.SIGKILL)
 
     def end(self) -> int:
-        """Stop everything; the exit code."""
+        """Stop all processes; returns the exit code."""
         for process in (self._main, *self._others):
             if process.poll() is None:
                 process.send_signal(signal.SIGINT)
@@ -265,7 +265,7 @@ class Graph:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Of the command line."""
+    """The parser of the command line."""
     made = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0] if __doc__ else "")
     made.add_argument("robot", choices=sorted(path.stem for path in HERE.glob("*.xml")), help="which arm")
     made.add_argument(
@@ -286,7 +286,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main() -> int:
-    """Until the bag ends, or Ctrl-C."""
+    """Run until the bag ends, or Ctrl-C."""
     args = parser().parse_args()
     file = ROBOTS / f"{args.robot}.yaml"
     try:

@@ -1,4 +1,4 @@
-"""An arm in MuJoCo whose joints have position servos, and a controller that goes to each new point in a stated time."""
+"""An arm in MuJoCo whose joints have position servos, and a controller that reaches each point in a stated time."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ class SimulatedArm:
     """Follows set points as a robot with ``joint_trajectory_controller`` or ``forward_command_controller`` does.
 
     Args:
-        file: the MuJoCo model; an actuator per joint, of the joint's name.
+        file: the MuJoCo model; an actuator per joint, with the joint's name.
         joints: n names, in the order of commands.
-        home: (n,) radians: where it stands.
+        home: (n,) radians: initial positions.
 
     Attributes:
-        set_point: (n,) radians: what the servos are told now.
+        set_point: (n,) radians: the present set points of the servos.
     """
 
     def __init__(self, file: Path, joints: Sequence[str], home: FloatArray) -> None:
@@ -40,25 +40,25 @@ class SimulatedArm:
 
     @property
     def position(self) -> FloatArray:
-        """(n,) radians: how the joints stand."""
+        """(n,) radians: positions of the joints."""
         return np.array(self._data.qpos[self._places])
 
     @property
     def velocity(self) -> FloatArray:
-        """(n,) rad/s."""
+        """(n,) rad/s: velocities of the joints."""
         return np.array(self._data.qvel[self._speeds])
 
     @property
     def points(self) -> FloatArray:
-        """(n + 1, 3) metres: where the joints and the tip are; z up."""
+        """(n + 1, 3) metres: places of the joints and of the tip; z up."""
         return np.vstack([self._data.xpos[self._bodies], self._data.site_xpos[self._tip]])
 
     def go_to(self, position: FloatArray, seconds: float = 0.0) -> None:
-        """Move the set point straight to (n,) radians, to be there after some time."""
+        """Move the set points linearly to (n,) radians within some seconds."""
         self._goal, self._remaining = position.copy(), seconds
 
     def advance(self, seconds: float) -> None:
-        """Let time pass."""
+        """Simulate some seconds."""
         step = self._model.opt.timestep
         for _ in range(round(seconds / step)):
             share = min(step / self._remaining, 1.0) if self._remaining > 0.0 else 1.0

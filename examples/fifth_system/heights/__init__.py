@@ -1,1 +1,1 @@
-"""A system that another package brings: how tall each filtered skeleton stands."""
+"""An example of a system in another package: the height of the filtered skeleton."""

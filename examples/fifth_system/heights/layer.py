@@ -1,4 +1,4 @@
-"""What the viewer shows of it."""
+"""Its layer in the viewer's scene."""
 
 from __future__ import annotations
 
@@ -6,6 +6,6 @@ from typing import Any
 
 
 def draw(scene: Any, path: str, payload: tuple[int, float] | None) -> None:
-    """A label with the height."""
+    """Draw a label with the height."""
     text = "" if payload is None else f"{payload[1]:.2f} m"
     scene.add_label(path, text, position=(0.0, 0.0, 1.0), visible=payload is not None)

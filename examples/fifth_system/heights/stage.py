@@ -1,4 +1,4 @@
-"""Its only stage."""
+"""The system's only stage, and the codec of its topic."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from heights.system import HEIGHT
 
 
 class Height(Codec):
-    """Stamp, and metres."""
+    """Stamp in nanoseconds, and height in metres."""
 
     type_name = IMAGE
 
@@ -42,7 +42,7 @@ class Height(Codec):
 
 
 class HeightStage(Stage):
-    """Measures filtered skeletons."""
+    """Measures the height of filtered skeletons."""
 
     NAME = "heights"
     PARAMETERS = (Parameter("margin", 0.1, "what there is above the head joint", unit="m", live=True), RELIABLE)

@@ -1,4 +1,4 @@
-"""What it adds to the graph."""
+"""The node, option, topic and layer that the system adds to the graph."""
 
 from __future__ import annotations
 
