@@ -55,7 +55,7 @@ def test_untracked_joints_have_infinite_noise() -> None:
     assert np.isfinite(np.delete(stddev, [Joint.HEAD, Joint.FOOT_LEFT])).all()
 
 
-def test_a_sensor_that_states_covariances_is_taken_at_its_word() -> None:
+def test_stated_covariances_are_used() -> None:
     states = TRACKED.copy()
     states[Joint.HEAD] = 0
     assert_allclose(joint_variance(AT_TWO_METRES, states, None), joint_stddev(AT_TWO_METRES, states) ** 2)

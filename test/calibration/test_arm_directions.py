@@ -91,7 +91,7 @@ def test_left_is_the_mirror_of_right() -> None:
 
 
 @pytest.mark.parametrize("missing", [Joint.SPINE_MID, Joint.SHOULDER_LEFT, Joint.ELBOW_RIGHT, Joint.WRIST_RIGHT])
-def test_what_is_unknown_leaves_the_rest_as_it_is(missing: Joint) -> None:
+def test_unknown_joints_leave_the_others_unchanged(missing: Joint) -> None:
     frame = skeleton(POSE.copy())
     frame.positions[missing] = np.nan
     frame.states[missing] = TrackingState.NOT_TRACKED

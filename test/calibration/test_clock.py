@@ -31,7 +31,7 @@ def test_an_offset_of_seconds_is_found_without_knowing_the_poses(offset: float) 
     assert found.margin > 0.08
 
 
-def test_nobody_moving_says_nothing() -> None:
+def test_without_motion_no_offset_is_found() -> None:
     rng = np.random.default_rng(3)
     times = np.arange(0.0, 12.0, 1 / 30)
     still = np.broadcast_to(walk(np.zeros(1))[0], (len(times), 25, 3))
@@ -148,7 +148,7 @@ def test_a_shifted_stream_shifts_the_answer_by_as_much() -> None:
         assert offset_at(shifted, at) - offset_at(plain, at) == pytest.approx(0.05 + 100e-6 * at, abs=within)
 
 
-def test_the_times_of_receipt_help_as_much_as_the_motion_leaves_open() -> None:
+def test_times_of_receipt_are_weighted_as_a_prior() -> None:
     """They pull the estimate, by their share of the information; an offset beyond the fit's range is ignored."""
     for seconds in (15.0, 55.0):
         plain, drawn, other = (
@@ -161,7 +161,7 @@ def test_the_times_of_receipt_help_as_much_as_the_motion_leaves_open() -> None:
         assert other == plain
 
 
-def test_what_is_known_exactly_is_kept() -> None:
+def test_an_exactly_known_clock_is_kept() -> None:
     expected = known(0.03, 100e-6, 10.0, 1e-5, 1e-8)
     found = fitted(0.02, 0.0, expected=expected)
     for at in (0.0, 60.0):
@@ -170,7 +170,7 @@ def test_what_is_known_exactly_is_kept() -> None:
     assert found.drift_stddev_ppm == pytest.approx(1e-2, rel=0.01)
 
 
-def test_the_same_motion_again_says_no_more_of_the_offset_but_of_the_drift() -> None:
+def test_repeated_motion_improves_the_drift_but_not_the_offset() -> None:
     once, often = fitted(0.02, 0.0), fitted(0.02, 0.0, repeated=6)
     floor = np.sqrt((once.stddev**2 - MIN_STDDEV**2) / 2.0 + MIN_STDDEV**2)  # after a minute half is common to all
     assert 0.95 * floor < often.stddev < once.stddev

@@ -95,7 +95,7 @@ def test_offsets_turn_with_the_body(turn: tuple[float, float, float], pose: int)
     assert_allclose(posed(moved, local), posed(POSES[pose], local) @ rotation.T, atol=1e-9)
 
 
-def test_a_bone_that_is_not_seen_turns_nothing_and_without_a_thorax_nothing_is_told() -> None:
+def test_an_unseen_bone_turns_no_offset_and_without_a_thorax_offsets_are_unknown() -> None:
     hidden = posed(without(POSES[3], Joint.HAND_LEFT), EYE)
     assert_allclose(hidden[5], posed(POSES[3], EYE)[5])
     assert np.isfinite(hidden).all()
@@ -132,7 +132,7 @@ def drawn(rng: np.random.Generator) -> tuple[FloatArray, FloatArray, FloatArray]
     return (points - points[Joint.SPINE_SHOULDER]) @ axes, offsets @ axes, transient
 
 
-def test_what_is_known_of_offsets_is_as_good_as_stated() -> None:
+def test_errors_of_offsets_agree_with_their_covariance() -> None:
     rng = np.random.default_rng(3)
     distances, errors, expected = [], [], 0
     for _ in range(400):
@@ -240,7 +240,7 @@ ODD = (
     + [(without(T_POSE, Joint[joint]), 0) for joint in ("SPINE_MID", "SHOULDER_LEFT", "ELBOW_RIGHT", "WRIST_LEFT")]
     + [(ODD, 1)],
 )
-def test_other_poses_teach_nothing(pose: FloatArray, refused: int) -> None:
+def test_other_poses_give_no_offsets(pose: FloatArray, refused: int) -> None:
     """Neither does a T-pose with a needed joint unseen; a refused pose is counted once."""
     counters: dict[str, int] = {}
     centres = JointCentres(counters)
@@ -250,7 +250,7 @@ def test_other_poses_teach_nothing(pose: FloatArray, refused: int) -> None:
     assert_allclose(corrected(centres, skeleton(pose, stamp_ns)), pose)
 
 
-def test_who_moves_or_is_seen_for_a_moment_teaches_nothing() -> None:
+def test_moving_or_briefly_seen_people_give_no_offsets() -> None:
     centres = JointCentres({})
     for number in range(90):
         wave = 0.08 * np.sin(number / 5.0) * body_axes(T_POSE)[:, 2]
@@ -273,7 +273,7 @@ def test_who_moves_or_is_seen_for_a_moment_teaches_nothing() -> None:
     assert centres.offsets is not None
 
 
-def test_hands_and_hips_that_are_not_seen_hinder_nothing() -> None:
+def test_offsets_need_neither_hands_nor_hips() -> None:
     local = some_offsets(2)
     hidden = without(seen(T_POSE, local), Joint.HAND_LEFT, Joint.HAND_RIGHT, Joint.SPINE_BASE)
     centres = JointCentres({})
@@ -315,7 +315,7 @@ def test_evidence_of_several_sensors_is_combined() -> None:
     assert both.offsets.share < one.offsets.share < 1.0
 
 
-def test_one_pose_is_one_however_many_see_it_and_another_is_another() -> None:
+def test_a_pose_is_counted_once_for_all_sensors() -> None:
     counters: dict[str, int] = {}
     centres = JointCentres(counters)
     aside = seen(T_POSE, some_offsets())
@@ -347,7 +347,7 @@ def test_a_short_second_pose_is_seen_too_and_a_slow_camera_does() -> None:
     assert counters["t_poses"] == 2
 
 
-def test_less_is_kept_of_offsets_the_farther_bones_point_from_where_they_did() -> None:
+def test_offsets_fade_with_the_angle_of_a_bone_from_the_t_pose() -> None:
     shares = np.array([retained(turned_arms(degrees)) for degrees in (0.0, 20.0, 45.0, 80.0)])
     assert (shares[:, :4] == 1.0).all()  # trunk and shoulders
     assert (shares[0] > 0.99).all()
@@ -360,7 +360,7 @@ def test_less_is_kept_of_offsets_the_farther_bones_point_from_where_they_did() -
     assert retained(hidden)[5] == retained(hidden)[4] == pytest.approx(shares[2, 4], rel=1e-3)
 
 
-def test_nothing_is_kept_from_a_bent_elbow_on() -> None:
+def test_no_offset_is_kept_from_a_bent_elbow_on() -> None:
     bends = (0.0, 15.0, 45.0, 67.0, 90.0, 130.0)
     shares = np.array([retained(bent_elbows(degrees)) for degrees in bends])
     assert (shares[:, :4] == 1.0).all()
@@ -399,7 +399,7 @@ def test_the_spread_of_offsets_shrinks_and_turns_with_the_body() -> None:
         assert_allclose(centres.spread(pose @ rotation.T, stamp_ns), all_joints @ after @ all_joints.T, atol=1e-9)
 
 
-def test_people_who_hold_no_t_pose_are_taken_for_none_who_do(shared_data: Path) -> None:
+def test_real_movements_without_a_t_pose_are_not_taken_for_one(shared_data: Path) -> None:
     """Three people who stand, step, walk, reach and turn, by two real sensors each: thirteen minutes in all."""
     frames = 0
     for path in some(sorted((shared_data / "kinect_pairs").glob("[op]*.csv.gz")), 4):

@@ -110,7 +110,7 @@ def test_a_known_motion_and_clock_are_recovered(shared_data: Path, name: str, of
         assert abs(moved.clocks["kinect2"].to_sensor(at) - before) < 0.005 * NANOSECONDS
 
 
-def test_what_is_published_never_jumps(shared_data: Path) -> None:
+def test_published_poses_never_jump(shared_data: Path) -> None:
     """No update moves a joint near the person by more than the slew rates allow, whatever the estimate does."""
     _, updates = run(recording(shared_data / "kinect_pairs" / "p12_90deg.csv.gz")[: draws(1700, 10_000)])
     poses = [(u.valid_from_ns, u.result.poses["kinect2"]) for u in updates if "kinect2" in u.result.poses]
@@ -297,7 +297,7 @@ def test_the_first_seconds_of_a_twist_do_not_move_the_clock_by_frames() -> None:
     assert moved <= len(seeds) // 10
 
 
-def test_the_times_of_receipt_tell_the_clock_of_somebody_who_does_not_move() -> None:
+def test_without_motion_times_of_receipt_give_the_clock() -> None:
     """To half a step of their grid; neither a burst at first nor single late frames matter."""
     frames = stream(8.0, offset=0.45, still=8.0)
     since = frames[0][2]
@@ -311,7 +311,7 @@ def test_the_times_of_receipt_tell_the_clock_of_somebody_who_does_not_move() -> 
         assert result.quality["kinect2"].clock_stddev == 0.05
 
 
-def test_neither_a_still_pose_nor_motion_that_tells_the_clock_is_needed() -> None:
+def test_neither_a_still_pose_nor_motion_that_determines_the_clock_is_needed() -> None:
     """Noise hides both; half a minute of a walk still determines the pose roughly."""
     calibration, _ = run(stream(20.0, still=-5.0, noise=0.12))
     assert calibration.status()[2]["kinect2 clock_from"] == "receipt"
@@ -419,7 +419,7 @@ def test_a_clock_that_was_set_since_it_was_saved_is_found_anew(offset: float) ->
     assert result.clocks["kinect2"].offset == pytest.approx(offset, abs=within)
 
 
-def test_a_bag_that_loops_keeps_the_poses_and_says_no_more_of_the_clock() -> None:
+def test_a_looping_bag_keeps_the_poses_and_adds_no_information_on_the_clock() -> None:
     once = saved_after()
     calibration, _ = run((*stream(15.0), *stream(15.0)))
     twice = calibration.result()

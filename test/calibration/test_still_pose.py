@@ -48,7 +48,7 @@ def test_the_t_pose_is_recognised() -> None:
     assert not is_t_pose(np.where(np.arange(25)[:, None] == 6, np.nan, POSE)[None])
 
 
-def test_the_averages_are_registered_on_what_both_track() -> None:
+def test_averages_are_registered_on_joints_that_both_track() -> None:
     rotation = about_y(60.0)
     states = np.full((FRAMES, 25), 2)
     theirs = (repeated() - [1.0, 0.2, 0.3]) @ rotation

@@ -73,7 +73,7 @@ def test_where_residuals_hardly_differ_the_sensors_agree_on_left_and_right() -> 
         assert angle_to(found.rotation) < 10.0
 
 
-def test_frames_are_exchanged_as_if_the_sensor_had_said_so() -> None:
+def test_swapped_frames_have_mirrored_joints_and_unknown_hands() -> None:
     pairs = pairs_of("hair_combing", 0.0)
     pairs.variance[:, Joint.HAND_LEFT] = np.inf
     frames = np.arange(len(pairs)) % 2 == 0
@@ -86,7 +86,7 @@ def test_frames_are_exchanged_as_if_the_sensor_had_said_so() -> None:
     assert_array_equal(with_sides_swapped(with_sides_swapped(pairs, frames), frames).sensor, pairs.sensor)
 
 
-def test_nothing_known_is_no_estimate() -> None:
+def test_without_known_joints_there_is_no_estimate() -> None:
     pairs = pairs_of("standing_still", 0.0)
     nothing = replace(pairs, variance=np.full_like(pairs.variance, np.inf))
     assert registration(nothing) is None

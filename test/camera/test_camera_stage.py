@@ -247,7 +247,7 @@ def test_missing_and_foreign_networks_are_named(tmp_path: Path) -> None:
 
 
 @networks
-def test_states_say_what_is_seen() -> None:
+def test_states_follow_visibility() -> None:
     node, recorded = calibrated(), recording()
     stamp_ns = next(iter(recorded.colour))
     # the lower half of the person is outside of the image

@@ -121,7 +121,7 @@ def test_the_far_shoulder_of_somebody_who_stands_obliquely_is_not_at_the_chest(g
         assert deeper > 0.0 or hidden < 1.0
 
 
-def test_what_lies_outside_the_image_is_not_invented() -> None:
+def test_joints_outside_the_image_are_not_tracked() -> None:
     found, depth = person()
     above = replace(found, pixels=found.pixels + [0.0, 180.0])
     moved = np.full_like(depth, 4.0)

@@ -44,7 +44,7 @@ def test_a_plane_stays_the_plane_that_it_is() -> None:
     assert np.median(off) < 0.006 and off.max() < 0.03
 
 
-def test_what_is_near_hides_what_is_behind() -> None:
+def test_near_surfaces_hide_those_behind() -> None:
     image = np.full((240, 320), 3.0, np.float32)
     image[100:140, 140:180] = 1.0
     seen = Registration(DEPTH, COLOUR, POSE)(image)

@@ -82,7 +82,7 @@ def covered(recording: SimulatedRecording, skeletons: list[Skeleton], of_bones: 
 
 
 @pytest.mark.slow
-def test_elbows_and_elevations_are_within_what_is_stated_if_the_joints_err_by_themselves() -> None:
+def test_bands_of_elbows_and_elevations_hold_for_independent_errors_of_joints() -> None:
     """With the correlation of a Kinect's joints, the bands of the elbows would cover two thirds of the frames."""
     names = [f"{name}_{side}" for name in ("elbow_flexion", "shoulder_elevation") for side in ("left", "right")]
     angles = [ANGLE_NAMES.index(name) for name in names]

@@ -91,7 +91,7 @@ def test_outliers_and_gaps_hardly_move_the_fit() -> None:
     assert np.isnan(found.residuals[100:130, 1]).all() and np.isfinite(found.residuals[100:130, 0]).all()
 
 
-def test_a_known_mounting_stays_and_its_error_goes_into_what_is_fitted() -> None:
+def test_a_known_mounting_stays_and_its_error_goes_into_the_fit() -> None:
     made = scene(5, seconds=20.0, bias_deg=5.0)
     known = {"forearm_left": Mounting(made.worn.mountings[2], np.radians(2.0) ** 2 * np.eye(3))}
     found, free = solve(made, known_mountings=known), solve(made)
@@ -150,7 +150,7 @@ def test_deviations_are_true_over_seeds(correlation: float) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("link", [1, 2])
-def test_a_real_pendulum_tells_the_clock_and_nothing_of_mountings(shared_data: Path, link: int) -> None:
+def test_a_real_pendulum_determines_the_clock_but_no_mountings(shared_data: Path, link: int) -> None:
     """It turns about one axis. Sensors and Vicon were stamped together: the offset is some ms, and wanders by 20.
 
     Not the third link, whose markers Vicon swapped for seconds, which looks like motion about a second axis.

@@ -167,7 +167,7 @@ def test_joint_centre_offsets_are_in_the_published_covariance() -> None:
     assert gain.mean() > 3.3 * gain.std(ddof=1) / np.sqrt(count)
 
 
-def test_sensors_that_contradict_each_other_do_not_start_it_anew_time_and_again() -> None:
+def test_contradicting_sensors_cause_no_repeated_restarts() -> None:
     """Four sensors with different constant errors of 4 cm: no pose fits them all, and a search for one is in vain."""
     rng = np.random.default_rng(3)
     truth = random_truth(3, 1.5)
@@ -445,7 +445,7 @@ def test_a_burst_of_late_frames_counts_as_each_alone_and_goes_back_once(seed: in
     assert in_order.counters["taken_again"] == 0
 
 
-def test_late_frames_count_in_what_is_predicted_and_in_the_next_frame() -> None:
+def test_late_frames_change_predictions_and_the_next_frame() -> None:
     frames, in_time = stalled(5)
     (last, its_sensor), others = frames[in_time - 1], frames[: in_time - 1]
     before, late = ExtendedKalmanFilter(), ExtendedKalmanFilter()
@@ -461,7 +461,7 @@ def test_late_frames_count_in_what_is_predicted_and_in_the_next_frame() -> None:
     assert_same(known(before), known(late), 1e-12)
 
 
-def test_what_is_too_late_is_dropped_and_counted() -> None:
+def test_frames_that_are_too_late_are_dropped_and_counted() -> None:
     skeletons = measured(random_truth(7, 2.0)).skeletons
     held, others = skeletons[40], [*skeletons[:40], *skeletons[41:50]]
     estimator = ExtendedKalmanFilter()
@@ -555,7 +555,7 @@ def test_a_prediction_continues_the_movement() -> None:
 
 
 @pytest.mark.parametrize("missing", [ARMS["LEFT"], EVERYTHING], ids=["an arm", "everybody"])
-def test_what_is_missing_is_predicted_and_comes_back(missing: tuple[Joint, ...]) -> None:
+def test_missing_joints_are_predicted_and_come_back(missing: tuple[Joint, ...]) -> None:
     truth = random_truth(16, 3.2, tempo=0.6)
     lost = np.isin(POINTS, missing)
     during = (truth.times >= 2.0) & (truth.times < 2.5)
@@ -720,7 +720,7 @@ def test_without_a_trunk_there_is_no_start() -> None:
 # --- parameters
 
 
-def test_of_a_person_who_stands_no_unobserved_angle_drifts_or_is_told() -> None:
+def test_unobserved_angles_of_a_standing_person_neither_drift_nor_gain_certainty() -> None:
     """Unobserved angles stay where they are, and keep the deviation of the posture prior, which alone determines them.
 
     Points that are known exactly leave two directions, along which the prior decides. The filter applies it to its
@@ -777,7 +777,7 @@ def posture_stddev(q: FloatArray, lengths: FloatArray) -> tuple[FloatArray, Floa
     return np.sqrt(covariance.diagonal()[columns]), prior.stddev[columns - 6]
 
 
-def test_a_covariance_that_is_none_any_more_starts_the_pose_anew() -> None:
+def test_an_invalid_covariance_restarts_the_pose() -> None:
     skeletons = measured(random_truth(8, 2.0)).skeletons
     estimator = ExtendedKalmanFilter()
     feed(estimator, skeletons[:20])

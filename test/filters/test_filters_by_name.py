@@ -121,7 +121,7 @@ ANEW = {"backward_jumps": (-50, "world"), "frame_changes": (2, "map"), "gaps": (
 @pytest.mark.parametrize(
     ("name", "cause"), [(name, cause) for name in FILTERS for cause in ANEW if cause != "gaps" or name in LINEAR_MODELS]
 )
-def test_it_starts_anew_as_a_fresh_one(name: str, cause: str) -> None:
+def test_a_restarted_filter_equals_a_new_one(name: str, cause: str) -> None:
     later, frame_id = ANEW[cause]
     # After a gap it is still the same person, whose joints are where a T-pose has shown them. A defect of the extended
     # filter: it corrects the first frame of another frame of reference by the T-pose of the person before.

@@ -244,7 +244,7 @@ def test_derivatives_of_an_orientation_against_differences(seed: int, corrected:
             assert_allclose(-analytic[:, column], difference, rtol=0.0, atol=1e-6)
 
 
-def test_what_is_expected_is_the_equation() -> None:
+def test_the_innovation_follows_the_equation() -> None:
     rng = np.random.default_rng(1)
     q, sources = random_pose(rng), known_sources(rng)
     rotation = MODEL.forward(q, MODEL.default_lengths()).rotations[sources.segments[1]]
@@ -275,7 +275,7 @@ def test_time_passes_over_the_covariance_of_sources_as_by_its_equation() -> None
     assert_allclose(after, transition @ before @ transition.T + noise, rtol=1e-12, atol=1e-12)
 
 
-def test_what_a_source_states_of_itself_is_what_is_known_of_it_at_first_and_later() -> None:
+def test_a_sources_variances_follow_its_stated_covariance() -> None:
     first = SegmentOrientation(0, "a", "head", np.eye(3), np.diag([1e-3, 3e-3, 0.03]))
     p = EkfParameters()
     sources, covariance = Sources.none().with_new(first, p)
@@ -328,7 +328,7 @@ def test_a_misalignment_is_found_over_movement_and_its_covariance_covers_it() ->
     assert error @ np.linalg.solve(covariance, error) < 18.5  # chi-square with 4 degrees of freedom, 0.999
 
 
-def test_what_nothing_tells_keeps_its_deviation() -> None:
+def test_an_unobserved_misalignment_keeps_its_deviation() -> None:
     """Without hands, a forearm's misalignment about its own axis cannot be distinguished from its rotation."""
     person = worn_person(3, 6.0, 0.01, HANDS)
     source = Source("forearm_left", (0.1, 0.05, 0.2))
@@ -363,7 +363,7 @@ def still(posture: dict[str, float], seconds: float, until: dict[str, float] | N
     ]
 
 
-def test_how_somebody_stands_is_no_error_of_the_sources() -> None:
+def test_posture_causes_no_error_of_the_sources() -> None:
     """A prior has the same error each time, and must not turn segments that are measured (before: 13 degrees)."""
     posture = {"lumbar_flexion": 30.0, "thoracic_flexion": 15.0, "lumbar_axial": 12.0, "clavicle_elevation_left": 20.0}
     estimator = ExtendedKalmanFilter()
@@ -397,7 +397,7 @@ def test_posture_shares_a_bend_between_measured_segments_and_does_not_turn_these
     assert abs(share - lumbar / (lumbar + thoracic)) < 0.1
 
 
-def test_what_a_silent_source_said_no_more_is_bounded_by_the_ranges() -> None:
+def test_ranges_bound_the_deviation_after_a_source_falls_silent() -> None:
     estimator = ExtendedKalmanFilter()
     feed(estimator, still({"elbow_flexion_right": 60.0}, 9.0, {"forearm_right": 4.0}))
     estimate = known(estimator)
@@ -419,7 +419,7 @@ def test_a_sensor_that_slips_leaves_the_angles_sound(turn: tuple[float, float, f
     assert sound.mean() > 0.97
 
 
-def test_a_camera_teaches_a_source_where_a_forearm_points_and_not_how_it_is_turned_about_itself() -> None:
+def test_a_camera_corrects_a_sources_direction_but_not_its_axial_rotation() -> None:
     q = MODEL.neutral()
     q[MODEL.scalar_q[[NAMES[v].startswith("elbow") for v in MODEL.scalar_v]]] = np.radians(16.0)
     posture = MODEL.forward(q, MODEL.default_lengths())
@@ -455,7 +455,7 @@ def turned_away(person: Person, begin: float, end: float) -> list[Skeleton]:
     ]
 
 
-def test_a_body_that_a_camera_takes_to_face_it_stays_turned_as_its_arms_tell() -> None:
+def test_inertial_sensors_keep_the_heading_of_a_body_that_a_camera_reverses() -> None:
     person = worn_person(3, 4.2)
     worn = Source("forearm_left", (0.05, 0.0, 0.1), 0.1, 0.05)
     estimator = ExtendedKalmanFilter()
@@ -542,7 +542,7 @@ def out_to_the_side(elbow: float, twist: float) -> FloatArray:
         pytest.param(3.0, id="after seconds of the camera alone", marks=pytest.mark.slow),
     ],
 )
-def test_an_upper_arm_is_turned_about_itself_as_its_sensor_says_however_a_camera_sees_it_bent(after: float) -> None:
+def test_an_inertial_sensor_decides_the_axial_rotation_of_an_upper_arm(after: float) -> None:
     truth = out_to_the_side(elbow=5.0, twist=0.0)
     rotation = MODEL.forward(truth, MODEL.default_lengths()).rotations[SEGMENT_NUMBER["upper_arm_right"]]
     frames = arm_bent_to_the_wrong_side(after + 3.0)
@@ -561,7 +561,7 @@ def test_an_upper_arm_is_turned_about_itself_as_its_sensor_says_however_a_camera
     assert abs(off[2]) < max(np.radians(15.0), 2.0 * stddev)
 
 
-def test_a_new_source_has_not_slipped_with_its_second_word() -> None:
+def test_first_rejections_of_a_new_source_are_no_slip() -> None:
     person = worn_person(15, 1.0, 0.01)
     far = Source("forearm_left", misalignment=(1.2, 0.0, 0.0)).measure(person)
     estimator = ExtendedKalmanFilter(EkfParameters(orientation_rate=50.0))
@@ -575,7 +575,7 @@ def test_a_new_source_has_not_slipped_with_its_second_word() -> None:
 
 
 @pytest.mark.parametrize("spin", some([0.05, None]), ids=str)
-def test_it_knows_how_sure_it_is_of_what_correlated_errors_leave(spin: float | None) -> None:
+def test_covariance_holds_under_correlated_errors(spin: float | None) -> None:
     observed = np.array([k for k, name in enumerate(NAMES) if name not in UNOBSERVED and k >= 6])
     p, normalised = EkfParameters(), []
     for seed in range(draws(1, 3)):
@@ -798,7 +798,7 @@ def test_a_pose_is_found_from_orientations() -> None:
     assert_allclose(q[:3], 0.0, atol=1e-9)
 
 
-def test_orientations_alone_tell_the_angles_and_that_nothing_tells_the_place() -> None:
+def test_orientations_alone_give_the_angles_and_an_unknown_place() -> None:
     person = worn_person(11, 3.5)
     segments = ("pelvis", "upper_trunk", "head", *FOREARMS, "upper_arm_left", "upper_arm_right")
     estimator = ExtendedKalmanFilter(PERFECT)

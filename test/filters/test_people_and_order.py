@@ -219,7 +219,7 @@ def test_a_skeleton_that_nobody_wants_is_not_made(events: list[Event]) -> None:
     assert wanted == [stamp_ns for topic, stamp_ns in everything if topic == graph.FILTERED]
 
 
-def test_nothing_is_predicted_for_a_time_of_which_frames_wait(events: list[Event]) -> None:
+def test_no_prediction_for_a_time_with_waiting_frames(events: list[Event]) -> None:
     rng = np.random.default_rng(1)
     kept = [event for event in events if rng.uniform() > 0.2]
     for settings in some([{"order_wait": 0.3}, {"predict_after": 0.02}, {}], 2):

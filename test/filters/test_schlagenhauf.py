@@ -259,7 +259,7 @@ def test_no_number_whatever_makes_it_fail(positions: FloatArray, states: np.ndar
 
 
 @pytest.mark.parametrize("damage", [np.nan, np.inf, 1e308])
-def test_a_broken_covariance_starts_it_anew_instead_of_handing_out_nan(damage: float) -> None:
+def test_a_broken_covariance_restarts_the_filter_without_nan(damage: float) -> None:
     tracker = started()
     tracker._kalman.P[:26, :26] += damage
     with np.errstate(all="ignore"):

@@ -143,7 +143,7 @@ def test_smoothed_joints_err_less_and_as_much_as_they_state() -> None:
     assert low < sum(normalised) < high
 
 
-def test_a_joint_that_was_started_anew_does_not_change_what_was_before() -> None:
+def test_a_restarted_joint_does_not_change_earlier_frames() -> None:
     away = BODY.copy()
     away[Joint.HAND_LEFT] += [0.0, 3.0, 0.0]
     frames = [frame(1 + k * FRAME_NS, BODY if k < 10 else away) for k in range(40)]

@@ -108,7 +108,7 @@ def test_a_pose_of_sensors_with_headings_of_their_own_tells_the_trunk_from_an_ar
     assert found.index("upper_trunk") == 1
 
 
-def test_what_is_not_sure_is_not_named() -> None:
+def test_uncertain_exchanges_are_not_reported() -> None:
     table = np.zeros((5, 5))
     table[1, 3] = table[3, 1] = SURE - 0.1
     assert assign(WORN, table) == WORN
@@ -117,7 +117,7 @@ def test_what_is_not_sure_is_not_named() -> None:
     assert assign(WORN, table) == ("upper_trunk", "upper_arm_right", "forearm_left", "upper_arm_left", "forearm_right")
 
 
-def test_that_both_bones_of_an_arm_turn_alike_makes_no_exchange() -> None:
+def test_similar_motion_of_an_arms_bones_causes_no_exchange() -> None:
     """Tables of a simulated person who reaches before a Kinect: first with exchanged forearms, then without."""
     names = ("upper_trunk", "upper_arm_left", "forearm_left", "upper_arm_right", "forearm_right")
     forearms = np.array(
@@ -163,7 +163,7 @@ def test_a_slip_is_found_within_seconds_and_noise_and_outliers_are_none() -> Non
     np.testing.assert_allclose(found[0][1], turn, atol=np.radians(10.0))
 
 
-def test_a_slip_smaller_than_what_is_known_is_none() -> None:
+def test_a_slip_within_the_uncertainty_is_not_detected() -> None:
     detector = SlipDetector()
     turn = np.array([0.0, np.radians(20.0), 0.0])
     assert all(detector.update(0.1 * n, turn, float(np.radians(15.0))) is None for n in range(600))

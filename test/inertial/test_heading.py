@@ -89,7 +89,7 @@ def by_bones(wearer: Wearer, stddev: float) -> Callable[[HeadingTracker, int, Fl
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_camera_finds_headings_of_which_nothing_was_known(seed: int) -> None:
+def test_a_camera_determines_unknown_headings(seed: int) -> None:
     wearer = Wearer(seed, 30.0, np.pi / np.sqrt(3.0))
     tracker = HeadingTracker(wearer.start)
     wearer.run(tracker, by_bones(wearer, 0.05), 6)
@@ -100,7 +100,7 @@ def test_a_camera_finds_headings_of_which_nothing_was_known(seed: int) -> None:
     assert (np.abs(error) < 3.5 * stddev).all()
 
 
-def test_what_is_stated_holds_with_a_camera_whose_errors_last_and_headings_that_drift() -> None:
+def test_covariance_holds_with_lasting_errors_of_the_camera_and_drifting_headings() -> None:
     inside = []
     for seed in range(draws(2, 4)):
         walk = np.radians(0.4)
@@ -118,7 +118,7 @@ def test_what_is_stated_holds_with_a_camera_whose_errors_last_and_headings_that_
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_an_elbow_holds_two_headings_together_and_what_they_share_drifts(seed: int) -> None:
+def test_an_elbow_bounds_the_difference_of_two_headings_and_their_common_part_drifts(seed: int) -> None:
     wearer = Wearer(seed, 40.0, np.radians(15.0))
     tracker = HeadingTracker(wearer.start)
 
@@ -166,7 +166,7 @@ def test_the_trunks_joints_have_ranges_too(child: str) -> None:
         tracker.observe_range(2.0, child, parent, (np.eye(3), np.eye(3)))
 
 
-def test_one_wild_skeleton_moves_nothing_much() -> None:
+def test_one_outlier_skeleton_hardly_changes_the_estimate() -> None:
     wearer = Wearer(4, 20.0, np.radians(5.0))
     tracker = HeadingTracker(wearer.start)
     wearer.run(tracker, by_bones(wearer, 0.03), 6)
@@ -179,7 +179,7 @@ def test_one_wild_skeleton_moves_nothing_much() -> None:
     assert np.linalg.norm(moved) < np.radians(4.0)
 
 
-def test_nothing_is_made_of_a_bone_that_is_not_seen_and_time_runs_forward() -> None:
+def test_unseen_bones_are_ignored_and_backward_time_is_refused() -> None:
     wearer = Wearer(0, 1.0, 0.1)
     tracker = HeadingTracker(wearer.start)
     sensors = wearer.sensors(0)

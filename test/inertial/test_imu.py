@@ -60,7 +60,7 @@ def test_a_quaternion_that_is_slightly_off_is_normalised(quat_xyzw: FloatArray, 
         ({"magnetic_field": np.array([0.2, 0.0, -0.4])}, "microtesla or gauss?"),
     ],
 )
-def test_what_no_sensor_can_have_said_is_an_error(quantities: dict[str, FloatArray], text: str) -> None:
+def test_impossible_readings_are_errors(quantities: dict[str, FloatArray], text: str) -> None:
     with pytest.raises(ImuSampleError, match=text) as error:
         of(**quantities)
     assert "\n" not in str(error.value)
@@ -101,7 +101,7 @@ def said(samples: Iterator[ImuSample]) -> list[str]:
 
 
 @pytest.mark.parametrize("hertz", [25.0, 100.0, 400.0])
-def test_nothing_is_said_of_a_sensor_in_order(hertz: float) -> None:
+def test_a_sensor_in_order_has_no_problems(hertz: float) -> None:
     assert said(arm(hertz=hertz)) == []
 
 
@@ -114,7 +114,7 @@ def test_nothing_is_said_of_a_sensor_in_order(hertz: float) -> None:
         ({"rate": 180.0 / np.pi / 3.0, "force": 1.0}, IN_DEGREES),
     ],
 )
-def test_what_many_readings_tell_is_said_once_also_where_a_replay_begins_anew(
+def test_problems_of_many_readings_are_reported_once_also_when_a_replay_restarts(
     wrong: dict[str, float], kind: str
 ) -> None:
     (line,) = said(each for _ in range(2) for each in arm(**wrong))

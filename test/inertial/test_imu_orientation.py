@@ -162,7 +162,7 @@ def test_deviations_cover_the_errors(magnetic: bool) -> None:
             assert run.heading_stddev[-1] > 2.0 * run.heading_stddev[len(run.times) // 8]
 
 
-def test_a_disturbed_field_is_told_and_does_not_turn_the_heading() -> None:
+def test_a_disturbed_field_is_detected_and_does_not_turn_the_heading() -> None:
     iron = Iron(np.array([1.25, 1.2, 0.9]), np.array([12.0, 4.0, 0.0]), 0.1, 20.0, 35.0)
     run = Run(measured(replace(CONSUMER, **STILL_RADIO), 40.0, rate_hz=50.0, iron=(iron,)), magnetic=True)
     there = (run.times > 21.0) & (run.times < 34.0)
@@ -202,7 +202,7 @@ def test_after_lost_readings_the_accelerometer_levels_the_sooner() -> None:
 
 
 @pytest.mark.parametrize("stamp_jitter", some([0.004, 0.0]))
-def test_what_a_clipped_rate_hid_is_made_up_for(stamp_jitter: float) -> None:
+def test_the_rotation_hidden_by_clipping_is_estimated(stamp_jitter: float) -> None:
     """With the gyroscope range known: the swings have up to 286 degrees per second."""
     samples = measured(replace(IDEAL, gyro_range=250.0, stamp_jitter=stamp_jitter), 10.0, motion=pivot)
     assert (np.abs(samples.angular_velocity) > np.radians(249.9)).any(axis=1).mean() > 0.1

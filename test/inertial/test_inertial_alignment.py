@@ -74,7 +74,7 @@ def test_a_pose_held_exactly_with_known_mountings_gives_them_back_and_the_headin
         np.testing.assert_allclose(found.oriented(number, measured[number][None])[0], pose[number], atol=1e-6)
 
 
-def test_alignment_and_heading_are_within_what_is_stated() -> None:
+def test_errors_of_alignment_and_heading_agree_with_their_covariance() -> None:
     pose, spread = pose_rotations(MODEL, "t")[NUMBERS], pose_covariance(MODEL, "t", WORN)
     single, together = [], []
     for seed in range(60):
@@ -134,7 +134,7 @@ def test_who_holds_a_pose_may_sway(sway: float, still: bool) -> None:
     assert bool(still_periods([swaying])) is still
 
 
-def test_what_is_replaced_has_nothing_in_common_with_what_stays() -> None:
+def test_replaced_alignments_are_uncorrelated_with_the_others() -> None:
     rng = np.random.default_rng(0)
     spread = rng.normal(size=(12, 12))
     whole = Alignment(WORN[:3], random_rotations(rng, 3), rng.normal(size=3), spread @ spread.T)

@@ -76,7 +76,7 @@ def test_a_drift_is_found_and_stamps_are_carried_back() -> None:
         assert found.to_reference(shown_ns) / NANOSECONDS == pytest.approx(time, abs=0.02)
 
 
-def test_who_does_not_move_and_whose_motion_repeats_itself_tells_no_offset() -> None:
+def test_stillness_and_periodic_motion_determine_no_offset() -> None:
     times = np.arange(0.0, 40.0, 0.01)
     rng = np.random.default_rng(0)
     noise = [np.abs(0.01 * rng.normal(size=len(times))) for _ in range(2)]
@@ -85,7 +85,7 @@ def test_who_does_not_move_and_whose_motion_repeats_itself_tells_no_offset() -> 
     assert clock_offset(turning(times, swing + noise[0]), turning(times + 0.4, swing + noise[1])) is None
 
 
-def test_the_motions_of_two_people_tell_no_offset() -> None:
+def test_the_motions_of_two_people_determine_no_offset() -> None:
     times = np.arange(0.0, 60.0, 0.01)
     rates = [np.linalg.norm(moved(times, seed), axis=1) for seed in range(draws(5, 8))]
     pairs = [(a, b) for a in range(len(rates)) for b in range(a)]

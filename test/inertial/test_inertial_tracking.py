@@ -154,7 +154,7 @@ def test_a_magnetic_disturbance_is_named_and_covered(oriented: bool) -> None:
     assert covered(fed, "forearm_left", 8.0).mean() > 0.95
 
 
-def test_without_a_camera_a_pose_aligns_and_what_drifts_is_stated() -> None:
+def test_without_a_camera_a_pose_aligns_and_the_drift_is_stated() -> None:
     imus = tuple(sensor(segment) for segment in WORN)
     fed = feed(recorded("forearm_rolling", imus, seed=5), TrackingParameters(camera=False, rate=2.0), seconds=8.0)
     assert fed.tracker.counters["alignments by a pose"] == 1

@@ -42,7 +42,7 @@ def test_all_segments_give_the_configuration_back(seed: int) -> None:
 
 @settings(max_examples=draws(8, 15), deadline=None)
 @given(SEEDS)
-def test_errors_are_within_what_is_stated_and_what_no_sensor_sees_keeps_its_range(seed: int) -> None:
+def test_errors_agree_with_the_covariance_and_unobserved_angles_keep_their_ranges(seed: int) -> None:
     rng = np.random.default_rng(seed)
     worn = ("pelvis", "upper_trunk", "upper_arm_left", "forearm_left")
     numbers = [MODEL.segment_names.index(name) for name in worn]

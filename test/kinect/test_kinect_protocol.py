@@ -129,7 +129,7 @@ def test_signed_packets_with_invalid_content_are_refused() -> None:
 
 
 @pytest.mark.parametrize("name", ["", "1a", "a/b", "ä", "a" * 33, "a\0b", " a"])
-def test_names_that_are_none(name: str) -> None:
+def test_invalid_names_are_refused(name: str) -> None:
     with pytest.raises(ProtocolError):
         protocol.sensor_bytes(name)
 

@@ -191,7 +191,7 @@ def test_the_pull_of_an_outlier_does_not_grow_with_its_distance() -> None:
     assert np.median(errors) < np.sqrt(3.0) * noise
 
 
-def test_what_it_cannot_start_from_is_an_error() -> None:
+def test_points_without_a_trunk_are_an_error() -> None:
     """One point of the trunk shows no trunk; a start that is given needs none."""
     _, lengths, points = people(1, 9)
     gone = of(Joint.SPINE_BASE, Joint.SPINE_SHOULDER)

@@ -84,7 +84,7 @@ def test_lengths_pose_and_rates_of_a_person_come_back() -> None:
         assert np.isfinite(estimate.covariance).all()
 
 
-def test_the_stated_deviations_hold_what_noise_does_to_what_is_seen() -> None:
+def test_errors_by_noise_are_within_the_stated_deviations() -> None:
     rng = np.random.default_rng(4)
     errors = []
     for estimate in followed(SkeletonFit(MODEL), np.arange(draws(100, 150)) * FRAME, rng)[40:]:
@@ -186,7 +186,7 @@ def test_segments_stand_where_their_joints_are() -> None:
 # --- news of lengths
 
 
-def test_lengths_are_told_at_first_when_they_change_and_when_they_settle_but_not_too_often() -> None:
+def test_lengths_are_published_first_on_changes_and_once_settled_but_not_too_often() -> None:
     changes = LengthChanges()
     lengths = np.array([0.3, 0.4])
     published = []
@@ -202,7 +202,7 @@ def test_lengths_are_told_at_first_when_they_change_and_when_they_settle_but_not
     assert published[-1][1] == lengths[0]  # exactly, once they settle
 
 
-def test_lengths_that_stay_are_told_once() -> None:
+def test_constant_lengths_are_published_once() -> None:
     changes = LengthChanges()
     assert [changes.due(k * NANOSECONDS, np.array([0.3])) for k in range(5)] == [True, False, False, False, False]
     changes.reset()

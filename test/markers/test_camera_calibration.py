@@ -119,7 +119,7 @@ def test_a_wrong_board_is_named_and_left_out(shared_data: Path, kind: str) -> No
         assert abs(edges - usual) < 0.0005
 
 
-def test_three_cameras_tell_whose_board_is_wrong() -> None:
+def test_three_cameras_identify_the_wrong_board() -> None:
     truth, rng = rig(3), np.random.default_rng(0)
     corners = seen_boards(truth, rng)
     # a view that all cameras see

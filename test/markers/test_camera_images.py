@@ -107,7 +107,7 @@ def test_a_source_that_is_too_late_leaves_sets_out(lab: Path) -> None:
         ("/a,/a", "images: 1 topics"),
     ],
 )
-def test_a_source_that_is_none_is_refused_with_its_name(lab: Path, images: str, said: str) -> None:
+def test_an_invalid_source_is_refused_with_its_name(lab: Path, images: str, said: str) -> None:
     write(lab, "left", "a.png", picture(0))
     write(lab, "right", "b.png", picture(0))
     with pytest.raises(CameraError) as caught:

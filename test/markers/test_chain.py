@@ -108,7 +108,7 @@ def wrong(frames: list[list[TargetPose]], step: FloatArray) -> list[list[TargetP
 
 
 @pytest.mark.slow
-def test_what_the_calibration_of_the_cameras_does_to_a_chain_and_to_its_angles_is_known() -> None:
+def test_errors_of_the_cameras_calibration_are_propagated_to_a_chain_and_its_angles() -> None:
     rng, tree = upper_body(15)
     frames = measured(rng, tree, random_posture(rng, tree, 150), scale=0.1)
     sensitivities = [calibrated(frame) for frame in frames]

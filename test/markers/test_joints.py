@@ -76,7 +76,7 @@ def test_the_closed_form_is_exact_without_noise(kind: JointKind) -> None:
 
 
 @pytest.mark.parametrize("kind", [JointKind.HINGE, JointKind.UNIVERSAL])
-def test_what_the_motion_leaves_open_is_as_the_thesis_fixes_it(kind: JointKind) -> None:
+def test_undetermined_parameters_are_fixed_as_in_the_thesis(kind: JointKind) -> None:
     joint = drawn(3, kind, 1, 40.0)[0]
     for rotation, centre in (
         (joint.parent_rotation, joint.parent_centre),
@@ -132,7 +132,7 @@ def test_a_recording_of_2000_frames_reaches_the_bars(kind: JointKind) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", JointKind)
-def test_a_small_motion_is_said_and_its_deviations_hold(kind: JointKind) -> None:
+def test_a_small_motion_is_reported_and_its_deviations_hold(kind: JointKind) -> None:
     errors, variances = [], []
     for seed in range(draws(5, 60)):
         truth, poses = drawn(200 + seed, kind, draws(300, 1000), 3.0)
@@ -149,7 +149,7 @@ def test_a_small_motion_is_said_and_its_deviations_hold(kind: JointKind) -> None
 
 @pytest.mark.parametrize("noise", some([1.0, 1e-2]))
 @pytest.mark.parametrize("kind", JointKind)
-def test_targets_that_stand_still_say_nothing_of_a_joint(kind: JointKind, noise: float) -> None:
+def test_still_targets_determine_no_joint(kind: JointKind, noise: float) -> None:
     rng = np.random.default_rng(5)
     tree = pair(rng, kind)
     poses = columns(measured(rng, tree, random_posture(rng, tree, 20, 0.0), scale=noise))
@@ -260,7 +260,7 @@ def test_a_real_knee_is_the_same_hinge_in_both_halves_of_a_trial(shared_data: Pa
 
 
 @pytest.mark.slow
-def test_a_real_hip_tells_of_soft_tissue_and_of_a_cluster_that_is_not_rigid(shared_data: Path) -> None:
+def test_a_real_hip_shows_soft_tissue_and_a_cluster_that_is_not_rigid(shared_data: Path) -> None:
     found = real(shared_data, "right_hip.c3d", PELVIS, THIGH, THIGH + EPICONDYLES)
     pelvis, thigh, wrong = (poses[::4] for poses in found)
     hip = fit_ball_joint(pelvis, thigh, "hip")

@@ -145,7 +145,7 @@ def test_a_wand_that_does_not_serve_is_refused_in_one_line(
         (["calibrate", "--camera", "left", "--columns", "9", "--rows", "6", "--square", "0.1"], "expected NAME=FOLDER"),
     ],
 )
-def test_what_does_not_serve_is_refused_in_one_line(
+def test_unusable_recordings_are_refused_in_one_line(
     turned: Path, tmp_path: Path, words: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     save_rig(stereo_rig(), tmp_path / setup.RIG)

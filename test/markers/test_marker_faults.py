@@ -81,7 +81,7 @@ def test_a_camera_turned_in_mid_run_is_named_within_a_second(tmp_path: Path, see
     assert watched.run(RATE // 2, rig(3)) == ""
 
 
-def test_a_finding_says_where_the_images_do_not_tell_the_camera() -> None:
+def test_a_finding_names_all_cameras_that_may_have_moved() -> None:
     assert str(Finding(Fault.MOVED_CAMERA, ("a", "b"), 0.0035, 1e-4)) == (
         "moved camera: a or b by 0.20 deg (which of them, the images cannot tell)"
     )
@@ -180,7 +180,7 @@ def seen(folder: Path, *messages: Any) -> tuple[list[ImageBalls], DetectorStage,
     ],
     ids=["colour", "size", "saturated", "saturated, 16 bits", "dark", "noise", "NaN", "empty"],
 )
-def test_images_that_show_no_balls_are_told_and_survived(
+def test_unusable_images_are_reported_and_survived(
     tmp_path: Path, bad: Any, refused: int, counted: str, said: str
 ) -> None:
     found, stage, count = seen(tmp_path, message(spots()), bad)

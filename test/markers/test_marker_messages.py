@@ -61,7 +61,7 @@ def test_images_round_trip(types: MessageTypes, kind: Any, pad: int) -> None:
         ({"width": 0}, "0 x 7 pixels"),
     ],
 )
-def test_images_that_are_none_are_refused(types: MessageTypes, changes: dict[str, Any], said: str) -> None:
+def test_invalid_images_are_refused(types: MessageTypes, changes: dict[str, Any], said: str) -> None:
     message = array_to_image(np.zeros((7, 11), np.uint8), STAMP_NS, "left", types)
     for name, value in changes.items():
         setattr(message, name, value)

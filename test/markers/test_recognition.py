@@ -102,7 +102,7 @@ def test_the_order_of_points_does_not_matter() -> None:
         assert np.array_equal(np.where(second[name].points >= 0, order[second[name].points], -1), fit.points)
 
 
-def test_deadline_is_kept_and_said() -> None:
+def test_deadline_is_kept_and_reported() -> None:
     """The search gives up within a few milliseconds of CPU after the deadline, however many points there are."""
     rng = np.random.default_rng(27)
     targets = random_targets(rng, 5)

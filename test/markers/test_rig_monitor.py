@@ -91,7 +91,7 @@ def test_of_two_cameras_a_turned_one_is_among_the_named(speed: float) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", some([2, 3]))
-def test_a_delay_of_one_frame_is_told_as_a_delay(count: int) -> None:
+def test_a_delay_of_one_frame_is_reported_as_a_delay(count: int) -> None:
     result = outcomes(Fault.OUT_OF_STEP, count, 1.0, delay=1.0 / RATE)
     assert result["wrong"] == 0 and result["named"] >= 0.8 * result.total()
     _, found = watched(count, 0, 1.0, delay=1.0 / RATE)
@@ -101,7 +101,7 @@ def test_a_delay_of_one_frame_is_told_as_a_delay(count: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("speed", some([1.0, 0.0, 4.0]))
-def test_nothing_is_told_of_a_rig_that_is_well(speed: float) -> None:
+def test_a_rig_in_order_has_no_findings(speed: float) -> None:
     for seed in range(draws(5, 30)):
         assert watched(2 + seed % 2, seed, speed) == (watched(2 + seed % 2, seed, speed, seconds=0.0)[0], None)
 

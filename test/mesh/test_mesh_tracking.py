@@ -80,7 +80,7 @@ def test_an_arm_that_comes_to_point_at_the_camera_is_followed(tracker: MeshTrack
     assert wrists.max() < 0.25
 
 
-def test_a_covered_lens_is_told_and_the_person_is_found_again_at_once(tracker: MeshTracker) -> None:
+def test_a_covered_lens_is_reported_and_the_person_is_found_again_at_once(tracker: MeshTracker) -> None:
     tracked(tracker, range(3))
     # within predict_for the pose is still expected
     for number in range(3, 9):

@@ -87,7 +87,7 @@ def test_a_node_answers(rigs: Rigs, words: list[str]) -> None:
         (["--namespace", "a b"], "namespace 'a b'"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(rigs: Rigs, words: list[str], message: str) -> None:
+def test_errors_are_reported_in_one_line(rigs: Rigs, words: list[str], message: str) -> None:
     code, printed, error = rigs.say(*words)
     assert code == 2 and not printed
     assert error.startswith(f"body_tracking: {message}") and error.count("\n") == 1, error

@@ -361,7 +361,7 @@ def test_another_publisher_of_the_commands_stops_at_once() -> None:
     assert bench.run(0.2).state == State.APPROACHING
 
 
-def test_a_robot_that_does_not_say_how_it_stands_waits_for_a_person() -> None:
+def test_a_robot_without_state_topic_waits_for_a_person() -> None:
     bench = Bench()
     bench.follower = Follower(mapping(), PERIOD)
     last = bench.run(3.0)
@@ -404,7 +404,7 @@ def test_it_begins_where_the_robot_stands() -> None:
         (("shoulder", "elbow"), [0.0, math.nan], "not finite"),
     ],
 )
-def test_joint_states_that_are_none_are_refused_and_not_followed(
+def test_invalid_joint_states_are_refused_and_not_followed(
     joints: tuple[str, ...], position: list[float], reported: str
 ) -> None:
     bench = Bench(state_topic=STATE_TOPIC)

@@ -166,7 +166,7 @@ def test_inertial_messages_hold_the_samples(crowd: tuple[SimulatedRecording, Pat
     assert force.mean() == pytest.approx(9.81, abs=0.5)
 
 
-def test_magnetometers_say_the_field(crowd: tuple[SimulatedRecording, Path]) -> None:
+def test_magnetometers_publish_the_field(crowd: tuple[SimulatedRecording, Path]) -> None:
     recording, folder = crowd
     for imu, samples in recording.imus:
         if samples.magnetic_field is None:

@@ -49,7 +49,7 @@ def test_a_sensor_that_sends_nothing_is_named() -> None:
     assert "Nothing comes" not in state_html(paused, 0.0, sensors=("a", "b", "c"))
 
 
-def test_an_end_is_said_and_what_to_do_then() -> None:
+def test_the_end_and_the_next_step_are_shown() -> None:
     running = {"fusion": NodeStatus("fusion: stream", 0, "OK", {}, 10.0)}
     assert "has ended" not in state_html(running, 10.5)
     assert "has ended" in state_html(running, 10.5, ended=True)

@@ -30,7 +30,7 @@ def test_a_silent_node_has_no_figures_any_more() -> None:
         ({"rate out /a": "fast", "rate out /b": "3.0", "delay median ms": "n/a"}, "3 Hz"),
     ],
 )
-def test_a_figure_that_is_none_is_left_out(values: dict[str, str], rate: str) -> None:
+def test_an_invalid_figure_is_left_out(values: dict[str, str], rate: str) -> None:
     text = table({"fusion": NodeStatus("fusion: stream", 0, "", values)}, 0.0)
     assert " ms" not in text and rate in text and ("Hz" in text) == bool(rate)
 
