@@ -96,7 +96,7 @@ class Correlation:
         rho: (l,) Pearson's correlation, over all values of a series together.
         variance: (l,) the smaller of the two series' variances.
         reference: (m, k) and (m,) values on the grid, and where they are known.
-        sensor: (m + l - 1, k) and (m + l - 1,) likewise; the lag n compares its samples from n on.
+        sensor: (m + l - 1, k) and (m + l - 1,) values, and where known; the lag n compares its samples from n on.
     """
 
     lags: FloatArray

@@ -5,4 +5,4 @@ A module owns its own exception, derived from this one; a caller that only shows
 
 
 class BodyTrackingError(Exception):
-    """Something outside the program is wrong; the text says what and where, in one line."""
+    """Something outside the program is wrong; the text names the problem and its place in one line."""

@@ -90,7 +90,7 @@ def offer_for(recorded: Sequence[Qos]) -> Qos:
 def request_for(offered: Sequence[Qos], depth: int) -> Qos:
     """The strongest profile of a subscription that matches every one of these publishers.
 
-    Reliable if every publisher is, transient local likewise; ``depth`` is the subscriber's queue, messages.
+    Reliable if every publisher is reliable, transient local if every publisher is; ``depth`` is in messages.
     """
     reliable = all(qos.reliability == "reliable" for qos in offered)
     latched = all(qos.durability == "transient_local" for qos in offered)

@@ -81,7 +81,7 @@ class CalibrationResult:
         reference: the sensor that defines ``world`` and its time.
         poses: a pose per calibrated sensor; a sensor that is not calibrated yet is absent.
         clocks: the clock of each sensor in ``poses``.
-        quality: likewise.
+        quality: of each sensor in ``poses``.
     """
 
     reference: str

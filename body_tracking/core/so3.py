@@ -2,7 +2,7 @@
 
 Quaternions are (x, y, z, w), as in ROS messages. The tangent is on the right: ``q * exp(v)`` turns first by ``v`` in
 the rotated frame. Formulas by Sola, Deray and Atchuthan, "A micro Lie theory for state estimation in robotics" (2018).
-scipy's Rotation does the same for one batch dimension and takes ten times as long for a single one.
+scipy's Rotation has one batch dimension, and takes ten times as long for a single rotation.
 """
 
 from __future__ import annotations

@@ -223,7 +223,7 @@ class Association:
         Args:
             sensor: its name.
             rotation: (3, 3) from the old pose, in world.
-            translation: (3,) metres, likewise.
+            translation: (3,) metres from the old pose, in world.
         """
         for person in self._people:
             track = person.sightings.get(sensor)

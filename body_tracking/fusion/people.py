@@ -98,7 +98,7 @@ class People(PlacedSensors[_Sensor]):
 
     @property
     def counts(self) -> dict[str, int]:
-        """How many people there are now, and what happened since the construction."""
+        """The present number of people, and event counts since the construction."""
         counters = {"people": len(self._association.people), **self._association.counters, **self.counters}
         if self._without:
             counters["people without a number"] = self._without

@@ -29,7 +29,7 @@ class Placement:
 
     def __init__(self) -> None:
         self._poses: list[SensorPose] = []  # by valid_from_ns
-        self._clocks: list[tuple[int, ClockModel]] = []  # likewise
+        self._clocks: list[tuple[int, ClockModel]] = []  # by the reference time from which each is valid
         self.clear()
 
     def clear(self) -> None:

@@ -36,7 +36,7 @@ def calibration_inputs(sensors: int, waiting: int = 0) -> tuple[Port, ...]:
 
 
 class FusionStage(Stage):
-    """Fuses what all sensors see of a person, or of several."""
+    """Fuses the skeletons of all sensors, of one person or of several."""
 
     NAME = "fusion"
     PARAMETERS = (

@@ -79,7 +79,7 @@ COUNTERPARTS: Final[dict[Joint, tuple[AzureJoint, AzureJoint]]] = {
     # all others have the same name in both
     **{joint: (AzureJoint[joint.name],) * 2 for joint in Joint if joint.name in AzureJoint.__members__},
 }
-"""The two joints of the SDK whose midpoint each joint is; the same one twice where it has a counterpart."""
+"""The two joints of the SDK whose midpoint gives each joint; one joint twice where it has a counterpart."""
 
 _FIRST: IntArray = np.array([COUNTERPARTS[joint][0] for joint in Joint], dtype=np.intp)
 _SECOND: IntArray = np.array([COUNTERPARTS[joint][1] for joint in Joint], dtype=np.intp)

@@ -20,7 +20,7 @@ _TRUNK: BoolArray = _SPINE | named("SHOULDER", "HIP")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capsules:
-    """The surface of a body: a capsule round each line between two joints, a ball where both are the same.
+    """The surface of a body: a capsule round each line between two joints, a ball if both are one joint.
 
     Attributes:
         starts: (k,) :class:`~body_tracking.core.skeleton.Joint` indices.

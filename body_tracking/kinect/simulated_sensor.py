@@ -8,8 +8,8 @@ the person faces away (``mirrored``). From the true joints to the reported ones:
    arms an error of direction by their pose (the inverse of ``calibration.arm_directions``, by ``anatomical``), and
    along the ray an offset by its kind (``depth_offset``);
 3. each joint has an error that is a function of pose and view (``bias``, ``bias_turn``, ``length_spread``), and one
-   that drifts with time (``drift``, ``drift_time``); :class:`Misreading` holds what is drawn once per person and type
-   of sensor;
+   that drifts with time (``drift``, ``drift_time``); :class:`Misreading` holds the random numbers that are drawn once
+   per person and type of sensor;
 4. a hidden joint is guessed (``guess``), pulled to the surface that hides it (``drag``) and released with a delay
    (``hang_over``); limbs nearly keep their lengths;
 5. all frames have white noise (``white``) and, rarely, outliers;

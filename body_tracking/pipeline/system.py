@@ -90,7 +90,7 @@ class TopicSpec:
 
 @dataclass(frozen=True, slots=True)
 class Service:
-    """A service of type ``std_srvs/srv/Trigger``: its name, the executable, what it does."""
+    """A service of type ``std_srvs/srv/Trigger``: its name, the executable that offers it, its purpose."""
 
     name: str
     executable: str
