@@ -22,7 +22,7 @@ def csv_row(stamp: object, offset: float = 0.0, **more: object) -> dict[str, obj
 
 
 def write_csv(path: Path, rows: Sequence[dict[str, object]], columns: list[str] | None = None) -> Path:
-    """A CSV recording of these rows, packed where the suffix says so."""
+    """Write a CSV recording of these rows, compressed if the suffix is ``.gz``."""
     text = io.StringIO()
     writer = csv.DictWriter(text, columns or list(rows[0]), lineterminator="\n")
     writer.writeheader()

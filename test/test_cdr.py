@@ -106,7 +106,7 @@ def test_truncated_message_is_not_decoded(seed: int, kind: int, missing: int) ->
 
 
 def test_padding_bytes_are_ignored() -> None:
-    """Fast CDR leaves in the padding what was in its buffer."""
+    """Fast CDR does not initialise padding."""
     serialization = pytest.importorskip("rclpy.serialization", reason="ROS is not installed")
     from body_tracking.messages.base import RosMessages
 

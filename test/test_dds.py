@@ -18,7 +18,7 @@ PERIOD = "{*}profiles/{*}data_writer/{*}times/{*}heartbeatPeriod/"
 @pytest.fixture(autouse=True)
 def nothing_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in (*dds.PROFILES, *OTHERS, RANGE):
-        # set first, so that what a test puts there is taken away again
+        # set first, so that pytest removes the test's value afterwards
         monkeypatch.setenv(name, "")
         monkeypatch.delenv(name)
     monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")

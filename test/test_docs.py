@@ -99,7 +99,7 @@ def test_commands_of_the_documentation_work(page: Path, tmp_path: Path, t_pose: 
             try:
                 code = process.wait(TIMEOUT)
             finally:
-                # with what the page left running in the background
+                # with background processes of the page
                 with contextlib.suppress(ProcessLookupError):
                     os.killpg(process.pid, signal.SIGKILL)
                 process.wait()

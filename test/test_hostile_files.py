@@ -121,7 +121,7 @@ def test_anchors_and_depth_within_reason_are_read() -> None:
 
 
 def zeros(size: int, announced: bool = True) -> bytes:
-    """A frame of zstd (RFC 8878) of so many zero bytes, four bytes for each 128 kB of them."""
+    """A zstd frame (RFC 8878) of ``size`` zero bytes; it has four bytes for each 128 kB."""
     block = 1 << 17
     blocks = [block] * (size // block) + [size % block]
     head = struct.pack("<IBB", 0xFD2FB528, 0xC0 if announced else 0, 0x50) + struct.pack("<Q", size) * announced
@@ -227,7 +227,7 @@ def test_a_sparse_file_of_gigabytes_is_not_read_into_memory(tmp_path: Path, kind
     refused_soon(path, read_whole)
 
 
-# --- what is no file
+# --- pipes and other special files
 
 
 @pytest.mark.parametrize(

@@ -212,7 +212,7 @@ CASES = [
 
 @pytest.fixture(scope="module")
 def played(tmp_path_factory: pytest.TempPathFactory, wave: Path) -> Callable[[str, str], Path]:
-    """The live graph's recording of a bag with a filter, which is what ``replay`` makes of it."""
+    """A function: the live graph's recording of a bag with a filter, which equals that of ``replay``."""
 
     @cache
     def play(name: str, filter_name: str) -> Path:
@@ -306,7 +306,7 @@ def test_two_people_are_the_same_live_and_offline(tmp_path: Path) -> None:
     )
     replay(bag, tmp_path / "offline", settings)
     arguments = ("--subject", "all", "--people", "3", "--params-file", parameters(tmp_path))
-    # what is loaded is published when a node starts: live before the first frame, offline with it
+    # a loaded calibration is published when a node starts: live before the first frame, offline with it
     without = inputs(bag) | OTHERS | {graph.CALIBRATION, graph.CALIBRATION_CLOCK}
     with BagReader(live_as_offline(tmp_path, bag, arguments, without, calibration)) as reader:
         angles = [reader.topics[graph.joint_states_topic(body)].count for body in ("body1", "body2", "body3")]

@@ -41,7 +41,7 @@ _REFERENCE = re.compile(r"`([\w/]+\.py)::([\w.]+)`")
 
 @dataclass(frozen=True)
 class Row:
-    """One line of a table: numbers in the paper, what it is, where it is here, remark."""
+    """One line of a table: numbers in the paper, subject, place in this package, remark."""
 
     paper: str
     numbers: str

@@ -211,7 +211,7 @@ def test_an_up_that_was_killed_with_all_its_nodes_is_back_when_it_is_started_aga
     assert not re.search("another body_tracking up|publishers", graph_up.text()), graph_up.text()
 
 
-# --- what is refused before anything starts
+# --- input that is refused before anything starts
 
 
 def refusal(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:

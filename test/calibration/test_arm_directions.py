@@ -43,7 +43,7 @@ def test_measured_is_the_inverse_of_anatomical() -> None:
 
 
 def test_a_lifted_arm_is_lowered_and_a_stretched_elbow_bent() -> None:
-    """What the recordings show: a gain of elevation above 1 to the side, elbows 6 to 10 degrees too straight."""
+    """As in the recordings: a gain of elevation above 1 to the side, elbows 6 to 10 degrees too straight."""
     side = np.array([[0.0, -1.0, 0.0], [0.0, -1.0, 0.0]])
     upper, forearm = KINECT_V2.anatomical(side)
     assert upper[2] < -0.05

@@ -53,7 +53,7 @@ def test_movement_overcomes_a_constant_distortion(seed: int) -> None:
 
 def test_the_stated_uncertainty_covers_the_error() -> None:
     """Normalised errors of rotation and translation at the person's place, over distorted still poses and walks."""
-    # A distortion that changes with place and heading averages out over many; what is left of it is drawn here.
+    # A distortion that changes with place and heading averages out over many; the remaining part is drawn here.
     stated = []
     for times, places, distortion in ((STILL, 1, 0.05), (WALK, 20, 0.05 / np.sqrt(6.0))):
         normalised = []

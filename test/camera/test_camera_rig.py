@@ -57,7 +57,7 @@ def person(at: FloatArray) -> FloatArray:
 def seen(
     rig: Rig, where: list[SensorPose], points: FloatArray, noise: float, rng: np.random.Generator
 ) -> list[Landmarks]:
-    """The landmarks in each camera, with errors of so many stated deviations."""
+    """The landmarks in each camera, with errors in units of the stated deviations."""
     first = where[0]
     pixels = rig.project((points - first.translation) @ first.rotation)
     sure = np.ones(len(Landmark))

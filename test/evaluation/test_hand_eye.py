@@ -72,7 +72,7 @@ def test_a_track_is_interpolated_and_unknown_in_gaps() -> None:
 def test_mountings_world_and_clock_are_exact_without_errors() -> None:
     made = scene(3, error_deg=0.0, markers_deg=1e-4, seconds=20.0)
     found = solve(made)
-    # interpolation between targets at 60 Hz is what is left
+    # the remaining error is that of interpolation between targets at 60 Hz
     assert np.degrees(np.abs(off(made.worn.world, found.world)).max()) < 0.02
     assert np.degrees(np.abs(off(made.worn.mountings, found.mountings)).max()) < 0.02
     assert found.clock == pytest.approx([OFFSET + DRIFT * found.middle, DRIFT], abs=2e-5)

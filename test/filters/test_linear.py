@@ -1,4 +1,4 @@
-"""The linear Kalman filters obey Kalman's equations, and survive what sensors do."""
+"""The linear Kalman filters obey Kalman's equations, and survive faults of sensors."""
 
 from __future__ import annotations
 

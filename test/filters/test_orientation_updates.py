@@ -378,7 +378,7 @@ def test_posture_causes_no_error_of_the_sources() -> None:
 
 
 def test_posture_shares_a_bend_between_measured_segments_and_does_not_turn_these() -> None:
-    """Pelvis and chest are measured: the prior decides how lumbar and thoracic joints share what is between them."""
+    """Pelvis and chest are measured: the prior shares the rotation between them among lumbar and thoracic joints."""
     events = [
         each
         for each in still({"lumbar_flexion": 30.0, "thoracic_flexion": 0.0}, 4.0)
@@ -507,7 +507,7 @@ def test_a_doubt_about_the_sides_fades_with_time_and_not_with_frames() -> None:
 
 
 def arm_bent_to_the_wrong_side(seconds: float) -> list[Skeleton]:
-    """What a camera shows of a straight right arm, held out to the side."""
+    """A camera's skeletons of a straight right arm, held out to the side, with the elbow bent to the wrong side."""
     seen = out_to_the_side(elbow=25.0, twist=125.0)
     positions = np.full((25, 3), np.nan)
     positions[MODEL.joints] = MODEL.forward(seen, MODEL.default_lengths()).positions

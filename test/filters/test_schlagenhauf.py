@@ -1,4 +1,4 @@
-"""The thesis's extended filter obeys algorithm 2 as published, but for its innovation, and survives what sensors do."""
+"""The thesis's extended filter is algorithm 2 as published, but for the innovation, and survives faults of sensors."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def test_nothing_starts_before_place_and_heading_are_seen(hidden: list[Joint]) -
 
 @pytest.mark.parametrize("motion", some(tuple(SHIPPED.values())))
 def test_it_follows_the_thesis_motions(motion: str) -> None:
-    """20 mm of white noise: nearer to the truth than what it is given, on the whole, with constant lengths."""
+    """20 mm of white noise: on average nearer to the truth than the measurements, with constant lengths."""
     rng = np.random.default_rng(3)
     truth = performed(motion)
     seen = truth + rng.normal(size=truth.shape) * 0.02

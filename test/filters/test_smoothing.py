@@ -200,7 +200,7 @@ def test_smoothed_people_err_less_and_by_no_more_than_they_state() -> None:
 
 
 class Bench:
-    """A filter of people, and what it has published: topic, stamp and time of publication."""
+    """A filter of people, and its published messages: topic, stamp and time of publication."""
 
     def __init__(self, name: str, **settings: Any) -> None:
         self.published: list[tuple[str, int, int]] = []

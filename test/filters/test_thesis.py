@@ -1,4 +1,4 @@
-"""The thesis's linear filters are algorithm 1 with eq. 5.11 and 5.12 as published, and survive what sensors do."""
+"""The thesis's linear filters are algorithm 1 with eq. 5.11 and 5.12 as published, and survive faults of sensors."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_the_gain_settles_where_the_riccati_equation_says(name: str) -> None:
     for k in range(1, 400):
         tracker.update(skeleton(k))
     assert_allclose(tracker.P, np.tile((np.eye(len(F)) - gain @ H) @ prior, (N_JOINTS, 1, 1)), rtol=1e-9, atol=1e-15)
-    # what a step of the measurement moves is the gain
+    # the response to a unit step of the measurement is the gain
     before = tracker.s
     tracker.update(skeleton(400, BODY + [1.0, 0.0, 0.0]))
     assert_allclose(tracker.s - before @ F.T, np.tile(gain[:, 0], (N_JOINTS, 1)), atol=1e-9)

@@ -87,7 +87,7 @@ def lowered(by: float) -> Callable[[Skeleton], Skeleton]:
     return lambda seen: replace(seen, positions=seen.positions + [0.0, by, 0.0])
 
 
-# --- what it is
+# --- outputs
 
 
 def test_noiseless_frames_give_the_truth_once_per_reference_frame() -> None:

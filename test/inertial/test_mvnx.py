@@ -1,4 +1,4 @@
-"""Xsens's recordings: what the file holds, under our names and in our units."""
+"""Xsens's recordings: the file's contents under our names and in our units."""
 
 from __future__ import annotations
 

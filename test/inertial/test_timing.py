@@ -16,7 +16,7 @@ SENSORS = ("forearm_left", "forearm_right")
 
 
 def receipts(offset_ns: int, transport_ns: int = 0, seconds: int = 3) -> list[tuple[int, int]]:
-    """Stamps of a clock that is ahead by so much, and when they were received."""
+    """(stamp, time of receipt) of a clock that is ahead by ``offset_ns``."""
     times = [10**12 + k * NANOSECONDS // 10 for k in range(10 * seconds)]
     return [(now + offset_ns, now + transport_ns + (k % 3) * 10**6) for k, now in enumerate(times)]
 

@@ -170,7 +170,7 @@ def test_frames_of_an_impossible_time_are_refused_and_change_nothing(sent: int) 
 
 
 def attacks(numbers: random.Random, partner: Partner, now: int) -> Iterator[tuple[str, bytes]]:
-    """Packets of every kind that should not be taken, and what they are."""
+    """Packets of every kind that must be refused, with their descriptions."""
     good = partner.sent[numbers.randrange(len(partner.sent))]
     yield "random", numbers.randbytes(numbers.randrange(protocol.MAX_PACKET + 200))
     yield "random behind a true header", good[:64] + numbers.randbytes(len(good) - 64)

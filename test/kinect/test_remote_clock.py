@@ -52,7 +52,7 @@ def test_with_jitter_the_offset_errs_by_less_than_half_the_shortest_round_trip(
     remote = round(local - true_offset(local, offset, drift))
     shortest = trips.round_trip_ns
     assert shortest >= 2 * least_ns
-    # a drift of 100 ppm moves 60 s of bounds by no more than what is fitted; half a millisecond is left for that
+    # the fit follows a drift of 100 ppm over 60 s of bounds, except for half a millisecond
     assert abs(trips.offset_ns(remote) - true_offset(local, offset, drift)) < shortest / 2 + MS // 2
 
 

@@ -158,7 +158,7 @@ def assert_rep155(q: FloatArray, a: dict[str, float]) -> None:
     """Axes of human_description; the torso of its tree, then head and arms."""
     r = rotations_of(q)
     torso = r["pelvis"] @ turn(Y, a["waist"])
-    assert abs((torso.T @ r["upper_trunk"] @ Z)[0]) < 1e-9  # what is left is lateral, and about the trunk itself
+    assert abs((torso.T @ r["upper_trunk"] @ Z)[0]) < 1e-9  # only lateral and axial rotation remain
     np.testing.assert_allclose(
         torso @ turn(X, a["r_head"]) @ turn(Z, a["y_head"]) @ turn(-Y, a["p_head"]), r["head"], atol=1e-9
     )
@@ -291,7 +291,7 @@ OUTER = {
 
 @pytest.mark.parametrize("name", CONVENTIONS)
 def test_the_standard_deviation_grows_towards_a_singular_pose(name: str) -> None:
-    """Outer angles: growing towards the singular pose, until they may be anything; the middle one stays what it is."""
+    """Deviations of the outer angles grow towards the singular pose without bound; the middle one's does not change."""
     stddev, before = 0.5 * DEGREE, 0.0
     flexion, abduction = SINGULAR[name]
     for away in (40.0, 20.0, 10.0, 6.0, 1.0, 0.0):

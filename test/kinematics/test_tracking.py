@@ -1,4 +1,4 @@
-"""A model that follows a skeleton: the truth comes back, and what cannot be known is said so."""
+"""A model that follows a skeleton: the truth comes back, and unobservable angles have large deviations."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_lengths_pose_and_rates_of_a_person_come_back() -> None:
         assert_allclose(estimate.lengths, LENGTHS, atol=1e-6)
         assert (estimate.stamp_ns, estimate.frame_id, estimate.body) == (round(time * NANOSECONDS), "world", 3)
         fitted, true = (MODEL.linearise(q, LENGTHS) for q in (estimate.q, motion(time)[0]))
-        # the ranges of motion draw a little at what the points hold
+        # the ranges of motion pull a little against the points
         assert np.abs(fitted.posture.positions - true.posture.positions).max() < 0.002
         moved = fitted.jacobian @ estimate.velocity - true.jacobian @ motion(time)[1]
         assert np.abs(moved).max() < 0.05

@@ -1,4 +1,4 @@
-"""The default body model: laws of its kinematics and what its points observe."""
+"""The default body model: laws of its kinematics, and the observability of its coordinates."""
 
 from __future__ import annotations
 

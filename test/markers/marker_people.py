@@ -83,7 +83,7 @@ def random_posture(
 def measured(
     rng: np.random.Generator, tree: Tree, posture: Posture, scale: float = 1.0, lost: float = 0.0
 ) -> list[list[TargetPose]]:
-    """Frames of poses with noise of so many times :data:`BALL_NOISE`; each pose is lost with some probability."""
+    """Frames of poses with noise of ``scale`` times :data:`BALL_NOISE`; each pose is lost with some probability."""
     rotations, translations = place(tree, posture)
     covariances = pose_covariances(rotations, scale)
     factors = np.linalg.cholesky(covariances)

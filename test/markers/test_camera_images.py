@@ -148,7 +148,7 @@ def colour(pixels: NDArray[Any], encoding: str) -> Any:
 def pushed(
     stage: CameraImagesStage, messages: Sequence[tuple[str, int, Any]]
 ) -> tuple[list[tuple[str, int, NDArray[Any]]], int]:
-    """Camera, stamp and pixels of what it publishes from (topic, stamp after the start, message), and refusals."""
+    """(camera, stamp, pixels) of the outputs for inputs (topic, stamp after the start, message), and refusals."""
     found: list[tuple[str, int, NDArray[Any]]] = []
 
     def sink(topic: str, cdr: bytes, at_ns: int) -> None:

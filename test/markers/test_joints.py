@@ -117,7 +117,7 @@ def test_errors_are_as_large_as_stated(kind: JointKind) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", JointKind)
 def test_a_recording_of_2000_frames_reaches_the_bars(kind: JointKind) -> None:
-    """Centre, axis and line within 1.5 times what the noise allows by the stated deviation."""
+    """Errors of centre, axis and line are within 1.5 times the stated deviation by the noise."""
     errors, deviations = [], []
     for seed in range(draws(8, 30)):
         truth, poses = drawn(500 + seed, kind, 2000, 60.0)

@@ -27,7 +27,7 @@ def test_the_errors_of_targets_are_in_the_deviations_of_joints() -> None:
     rotations, translations = place(tree, random_posture(rng, tree, 24))
     spread = 5e-5
     for _ in range(6):
-        # without what moves or turns a target as a whole, which is its frame
+        # without errors that move or turn a target as a whole, which belong to its frame
         wrong = []
         for body in bodies:
             whole = np.concatenate([np.tile(np.eye(3), (5, 1, 1)), -so3.skew(body.points)], axis=-1).reshape(15, 6)

@@ -106,7 +106,7 @@ def test_targets_that_cross_keep_their_names() -> None:
 
 
 def test_time_that_runs_backwards_resets() -> None:
-    """And the frames after it give what they gave the first time."""
+    """The frames after the jump give the results of the first time."""
     rng = np.random.default_rng(56)
     targets = target_set(6, 2)
     frames = [measure(true, rng, stamp + 10) for stamp, true, _, _ in moving(targets, 1.0, rng, 10, 20)]

@@ -1,4 +1,4 @@
-"""Calibration by a waved wand: stated deviations over seeds, wrong sightings, and what is refused."""
+"""Calibration by a waved wand: stated deviations over seeds, wrong sightings, and refused input."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_a_wand_is_found_among_other_balls_or_not_at_all() -> None:
     assert found is not None
     np.testing.assert_array_equal(found, [3, 4, 2])
     assert WAND.find(wand[:2]) is None
-    assert WAND.find(np.concatenate([wand, wand + 100.0])) is None  # which of both it is cannot be told
+    assert WAND.find(np.concatenate([wand, wand + 100.0])) is None  # ambiguous
     assert WAND.find(np.random.default_rng(0).uniform(0.0, 480.0, (40, 2))) is None
 
 

@@ -1,4 +1,4 @@
-"""Depth images as messages: both encodings, any row length and byte order, and what is refused."""
+"""Depth images as messages: both encodings, any row length and byte order, and refused messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The depth buffer against what rays meet."""
+"""The depth buffer against the intersections of rays."""
 
 from __future__ import annotations
 

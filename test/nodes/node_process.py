@@ -30,7 +30,7 @@ class NodeProcess:
 
     Args:
         executable: as for ``ros2 run``.
-        arguments: what follows it.
+        arguments: of the executable.
         log: file for all that it prints.
         environment: of the process.
         folder: working directory; None for that of the tests.
@@ -80,7 +80,7 @@ class NodeProcess:
         self.send_signal(signal.SIGKILL)
 
     def output(self) -> str:
-        """What it has printed so far."""
+        """Its output so far."""
         return self._log.read_text()
 
 

@@ -148,14 +148,14 @@ class Running:
         return process
 
     def start_interpreter(self, executable: str, name: str = "", **parameters: object) -> subprocess.Popen[bytes]:
-        """Start a node that imports for itself, where what is installed is another."""
+        """Start a node that runs its own imports, for tests with other installed packages."""
         words = words_of(parameters, name)
         return self.start_module(name or executable, "body_tracking.nodes", executable, "--ros-args", *words)
 
     def start_module(
         self, name: str, module: str, *words: str | Path, folder: Path | None = None
     ) -> subprocess.Popen[bytes]:
-        """Start what ``python -m`` does, in a folder; its output goes to a file."""
+        """Run ``python -m`` in a folder; its output goes to a file."""
         variables = {**self.environment, PARENT_VARIABLE: str(os.getpid())}  # no node outlives the tests
         if folder is not None:
             variables["PYTHONPATH"] = str(ROOT)
@@ -217,7 +217,7 @@ class Running:
         return result.successful, result.reason
 
     def log(self, executable: str) -> str:
-        """What a node printed so far."""
+        """A node's output so far."""
         return (self.folder / f"{executable}.log").read_text()
 
     def until(self, condition: Callable[[], object], timeout: float = PATIENCE) -> bool:

@@ -100,7 +100,7 @@ def on_the_wire(cdr: bytes) -> bytes:
 
 
 class Bench(Running):
-    """The processes of one test and a node to look at what they do."""
+    """The processes of one test, and a node that observes them."""
 
     def wait_until(self, condition: Callable[[], Any], what: str, seconds: float = 30.0) -> None:
         """Spin until a condition holds; the test fails if it does not."""

@@ -36,7 +36,7 @@ class Rigs(Running):
         self.node.create_client(Trigger, "/mesh_tracker/personalise")
 
     def say(self, *words: str) -> tuple[int, str, str]:
-        """The exit code of ``body_tracking call``, what it printed, and its error."""
+        """Exit code, output and error output of ``body_tracking call``."""
         command = [sys.executable, "-m", "body_tracking.cli", "call", *words]
         done = subprocess.run(command, env=self.environment, capture_output=True, text=True, timeout=60)
         return done.returncode, done.stdout, done.stderr

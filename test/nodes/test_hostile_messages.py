@@ -74,7 +74,7 @@ def test_invalid_clocks_and_poses_end_no_node(tmp_path: Path) -> None:
             poses.publish(transform)
         nodes = ("fusion", "skeleton_filter")
         running.start("fusion")
-        running.start("skeleton_filter", filter="ekf")  # both are started after what is latched
+        running.start("skeleton_filter", filter="ekf")  # both start after the latched messages
         assert running.until(lambda: all(running.number(node, "malformed") == 5 for node in nodes)), running.diagnostics
         for node in nodes:
             assert running.processes[node].poll() is None
@@ -173,7 +173,7 @@ def test_recorder_without_clock_records_nothing_and_reports_it(tmp_path: Path) -
     assert max(len(raw.cdr) for raw in found) < 100
 
 
-# --- what a callback raises
+# --- errors of callbacks
 
 
 class Failing(GraphNode):

@@ -183,7 +183,7 @@ def test_offline_gives_the_angles_that_the_graph_gave(wrists: Wrists, offline: A
     measured = np.isfinite(off) & np.isfinite(spread)
     inside = (np.abs(off[measured]) < 1.96 * np.sqrt(2.0) * spread[measured]).mean()
     assert inside > 0.95
-    assert np.median(np.abs(off[measured]) / spread[measured]) < 0.5  # small beside what is stated of either
+    assert np.median(np.abs(off[measured]) / spread[measured]) < 0.5  # small beside the stated deviations
 
 
 def test_silent_sensor_is_reported(wrists: Wrists) -> None:

@@ -116,7 +116,7 @@ class Tracking(Running):
         return self.until(one_more, 30.0)
 
     def cut_short(self) -> None:
-        """Forget what was collected."""
+        """Forget the collected messages."""
         for messages in (self.skeletons, self.states, self.stddevs, self.covariances, self.segments, self.angles):
             messages.clear()
         self.deviations.clear()
@@ -169,7 +169,7 @@ def test_all_messages_describe_the_same_state(tracking: Tracking) -> None:
         np.testing.assert_allclose(
             np.sqrt(covariance.diagonal()), [*deviation.position, *deviation.velocity], rtol=1e-5
         )
-        # Base and segments: the state says where they are.
+        # Base and segments are where the state has them.
         np.testing.assert_allclose(q[:3], skeleton.positions[Joint.SPINE_BASE], atol=1e-5)
         assert tuple(segments.joint_names) == MODEL.segment_names
         forearm = segments.transforms[MODEL.segment_names.index("forearm_left")].translation

@@ -104,7 +104,7 @@ def test_two_rigs_run_in_one_domain(rigs: Rigs) -> None:
             for topic in (graph.skeleton_topic("kinect1"), graph.FUSED, graph.FILTERED, graph.CALIBRATION)
         ]
         assert rigs.until(lambda own=own: [rigs.node.count_publishers(topic) for topic in own] == [1] * len(own))
-        # what fusion takes of its sensor is what one sensor sends, and the rig's own supervisor reports it
+        # fusion receives the rate of one sensor, and the rig's own supervisor reports it
         key = f"rate in /{rig}/kinect1/skeleton"
         assert rigs.until(lambda r=rig, k=key: 15.0 < float(rigs.said(f"{r}/fusion").get(k, 0.0)) < 45.0)
         line = re.compile(r"kinect1 [1-9]\d*, fused [1-9]\d*, angles [1-9]\d* Hz")

@@ -365,7 +365,7 @@ def joints_of(mapping: RobotMapping, angles: Sequence[tuple[float, JointState]],
 
 
 def following(log: str) -> list[tuple[float, float]]:
-    """The wall times between which a log of ``robot_commands`` says that it followed."""
+    """(begin, end) wall times in which ``robot_commands`` followed, by its log."""
     said = re.findall(r"\[(\d+\.\d+)\] \[robot_commands\]: (\w+) -> (\w+)", log)
     begun = [float(at) for at, _, state in said if state == State.FOLLOWING]
     ended = [float(at) for at, state, _ in said if state == State.FOLLOWING]

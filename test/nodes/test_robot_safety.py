@@ -36,7 +36,7 @@ RATE = 2.0
 """rad/s of the arm's joint."""
 ANGLE = {"isb": "shoulder_elevation_left", "positional": "shoulder_elevation_left"}
 ROBOTS = {
-    # name: whether the robot says where it stands
+    # name: whether the robot publishes its position
     "stale": True,
     "clock": True,
     "convention": True,
@@ -153,7 +153,7 @@ class Robot:
 
 
 class Bench:
-    """All robots, their nodes each in a thread of its own, and what they listen to, 30 times a second."""
+    """All robots, their nodes in a thread each, and the inputs of the nodes at 30 Hz."""
 
     def __init__(self, folder: Path) -> None:
         files = {name: mapping(name, folder, state=state) for name, state in ROBOTS.items()}

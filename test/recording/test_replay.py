@@ -74,7 +74,7 @@ Command = Callable[..., tuple[int, str, str]]
 
 @pytest.fixture
 def command(capsys: pytest.CaptureFixture[str]) -> Command:
-    """Runs a command in this process; its exit code, and what it printed."""
+    """A function that runs a command in this process and returns exit code and output."""
 
     def run(*arguments: str | Path) -> tuple[int, str, str]:
         try:

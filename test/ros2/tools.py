@@ -57,7 +57,7 @@ class Tool:
             )
 
     def text(self) -> str:
-        """What it has printed so far."""
+        """Its output so far."""
         return self.log.read_text(encoding="utf-8")
 
     def ended(self, timeout: float = 60.0) -> int:

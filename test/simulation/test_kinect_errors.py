@@ -405,7 +405,7 @@ def test_outliers_are_as_frequent_and_as_far_as_stated() -> None:
 def frames_of(
     sensor: SimulatedKinect, duration: float = 60.0, seed: int = 0
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Capture times, then stamps and times of receipt of what arrives, all in seconds after the start."""
+    """Capture times, then stamps and times of receipt of the arriving frames, all in seconds after the start."""
     rng = np.random.default_rng(seed)
     times = sensor.capture_times(duration, rng)
     truth = np.repeat(still(1.0)[:1], len(times), axis=0)

@@ -85,7 +85,7 @@ def test_intensities_give_the_colour_back_as_a_screen_shows_them() -> None:
     grey = np.arange(256, dtype=np.uint8)
     intensities = linear(np.stack([grey] * 3, axis=1)) / 255.0
     shown = np.where(intensities <= 0.0031308, 12.92 * intensities, 1.055 * intensities ** (1 / 2.4) - 0.055)
-    assert np.abs(255.0 * shown - grey[:, None])[30:].max() < 5.0  # of dark ones, 8 bits tell few apart
+    assert np.abs(255.0 * shown - grey[:, None])[30:].max() < 5.0  # 8 bits resolve dark ones poorly
     assert (linear((0, 0, 0)) == 0).all() and (linear((255, 255, 255)) == 255).all()
 
 
