@@ -62,11 +62,10 @@ def run(args: argparse.Namespace) -> int:
         raise no_ros(error) from error
     given = _viewer_parameters(args)
     host, port, said = str(given.get("host", "127.0.0.1")), int(str(given.get("port", _PORT))), ("", "")
-    first = True
+    choice: Any = None
     try:
         while True:
-            port, choice, found = _choose(args, host, port, *said, announce=first)
-            first = False
+            port, choice, found = _choose(args, host, port, *said, choice)
             what = choice.bag.name if choice.bag is not None else "the graph"
             try:
                 supervisor = supervise(_graph(args, choice), found, {"viewer": {"host": host, "port": port}})
@@ -104,9 +103,12 @@ def _graph(args: argparse.Namespace, choice: Any) -> argparse.Namespace:
 
 
 def _choose(
-    args: argparse.Namespace, host: str, port: int, said: str, how: str, *, announce: bool
+    args: argparse.Namespace, host: str, port: int, said: str, how: str, before: Any
 ) -> tuple[int, Any, Mapping[str, Value]]:
-    """Show the start page until the user has chosen: its port, the choice, and options for the sensors."""
+    """Show the start page until the user has chosen: its port, the choice, and options for the sensors.
+
+    Without a choice ``before`` this is the first page, whose address is printed.
+    """
     try:
         from body_tracking.viewing.start_page import StartPage
     except ImportError as error:
@@ -117,8 +119,8 @@ def _choose(
 
     named = (args.params_file is not None and has_sensors(args.params_file)) or names_sensors(options_from(args))
     chosen: queue.Queue[Any] = queue.Queue()
-    with StartPage(host, port, tuple(FILTERS), chosen.put) as page, Watch(args.namespace or "/") as watch:
-        if announce:
+    with StartPage(host, port, tuple(FILTERS), chosen.put, before) as page, Watch(args.namespace or "/") as watch:
+        if before is None:
             print(f"open {page.address} in a browser; Ctrl-C ends", flush=True)
         if said:
             page.say(said, RED if how == "failed" else GREEN)

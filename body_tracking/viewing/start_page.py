@@ -59,13 +59,22 @@ class StartPage:
         port: the first one to try.
         filters: options.
         choose: called with the user's choice, in a thread of the server.
+        before: the user's previous choice, whose loop and filter are offered again.
 
     Raises:
         PageError: as of :func:`serve`.
     """
 
-    def __init__(self, host: str, port: int, filters: Sequence[str], choose: Callable[[Choice], None]) -> None:
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        filters: Sequence[str],
+        choose: Callable[[Choice], None],
+        before: Choice | None = None,
+    ) -> None:
         self._choose = choose
+        looped, chosen = (before.loop, before.filter) if before is not None else (False, DEFAULT)
         self._server = serve(host, port)
         scene, gui = self._server.scene, self._server.gui
         scene.set_up_direction("+z")
@@ -78,8 +87,8 @@ class StartPage:
             self._sensors = gui.add_html("")
             self._start: Any = gui.add_button("start with these sensors", visible=False)
         with gui.add_folder("How"):
-            self._filter: Any = gui.add_dropdown("filter", (DEFAULT, *filters))
-            self._loop: Any = gui.add_checkbox("loop", False, hint="play the recording again at its end")
+            self._filter: Any = gui.add_dropdown("filter", (DEFAULT, *filters), initial_value=chosen)
+            self._loop: Any = gui.add_checkbox("loop", looped, hint="play the recording again at its end")
         with gui.add_folder("Nodes"):
             self._nodes = gui.add_html("")
         self._start.on_click(lambda _: self._choose(self._choice(None)))

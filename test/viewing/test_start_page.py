@@ -1,0 +1,21 @@
+"""The start page, on a server without a browser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("viser", reason="viser is not installed")
+
+from body_tracking.viewing.start_page import DEFAULT, Choice, StartPage
+
+FILTERS = ("lkf_constant_velocity", "ekf")
+
+
+@pytest.mark.parametrize("before", [None, Choice(Path("wave"), True, "ekf"), Choice(None, False, DEFAULT)])
+def test_loop_and_filter_are_offered_again(before: Choice | None) -> None:
+    """After a recording has ended, or a graph did not start, the user need not set them anew."""
+    with StartPage("127.0.0.1", 18080, FILTERS, lambda choice: None, before) as page:
+        found = page._choice(None)
+    assert found == Choice(None, before is not None and before.loop, DEFAULT if before is None else before.filter)
