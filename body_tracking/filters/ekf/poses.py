@@ -163,6 +163,9 @@ class PoseSearch:
         """Restart the pose if another one fits the rejected points much better."""
         space = self._space
         points, stddev = self._as_fitted(measurement, state)
+        # a rejected point that another sensor has just confirmed is no reason for another pose
+        confirmed = measurement.measured & (state.rejected_for > 0.0) & self._confirmed(state, measurement)
+        points[confirmed] = self._model.forward(state.q, state.lengths).positions[confirmed]
         started = self._restarted(state, points, stddev, _MUCH_BETTER)
         if started is not state or state.settled or int(measurement.measured.sum()) < _WHOLE:
             return started
@@ -170,6 +173,15 @@ class PoseSearch:
         covariance = state.covariance.copy()
         covariance[space.lengths, space.lengths] += space.lengths_covariance
         return state.but(covariance=covariance)
+
+    def _confirmed(self, state: State, measurement: Measurement) -> BoolArray:
+        """(19,) whether the last frame of another sensor, not long ago, was accepted at the point."""
+        earliest_ns = measurement.stamp_ns - self._parameters.reacquire_after * NANOSECONDS
+        confirmed = np.zeros(self._space.points, dtype=np.bool_)
+        for name, sensor in state.sensors.items():
+            if name != measurement.sensor and sensor.stamps and sensor.stamps[-1] >= earliest_ns:
+                confirmed |= np.isfinite(sensor.positions[-1, :, 0])
+        return confirmed
 
     def _astray(self, state: State, measurement: Measurement, back: BoolArray) -> bool:
         """Whether the updated pose misses any of the reappeared points (19,)."""
