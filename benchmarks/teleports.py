@@ -9,7 +9,8 @@ clips       real exercises of the right arm in front of one Kinect v2 (``kinect_
 
 ``unusual`` is the percentage of the shoulders with a known direction (first two angles below 15 degrees, conventions of
 the model) in an unusual branch: the angles are outside their usual ranges by 30 degrees more than the equivalent triple
-of the same rotation. Both a step and an unusual branch mislead a user of the angles.
+of the same rotation. ``twisted`` is the percentage of the known twists of the trunk (standard deviation below 15
+degrees) that no person can do, more than 80 degrees. Steps, unusual branches and such twists mislead a user.
 
 Recordings and pairs are replayed as by ``body_tracking replay``, with each filter in turn; clips are filtered frame by
 frame. ``known`` is the share of the frames with angles in which elevation, plane of elevation, elbow and trunk angles
@@ -57,6 +58,7 @@ KNOWN = 90.0
 PARTS = ("simulated", "pairs", "clips")
 RAISED = np.radians(30.0), np.radians(150.0)
 _UNUSUAL = np.radians(30.0)
+_TWISTED = np.radians(80.0)
 _FIRST_SEED = 5300
 """Far from the seeds of all other benchmarks."""
 
@@ -105,6 +107,13 @@ def unusual(angles: AngleSeries) -> tuple[int, int]:
         sure = (angles.stddev[:, columns[:2]] < SURE).all(axis=1)
         found += np.array([sure.sum(), (sure & (own - other > _UNUSUAL)).sum()])
     return int(found[0]), int(found[1])
+
+
+def twisted(angles: AngleSeries) -> tuple[int, int]:
+    """Number of known twists of the trunk, and number of those that no person can do."""
+    column = next(k for k, name in enumerate(angles.names) if name.startswith("trunk_axial"))
+    sure = angles.stddev[:, column] < SURE
+    return int(sure.sum()), int((sure & (np.abs(angles.position[:, column]) > _TWISTED)).sum())
 
 
 def _outside(triples: FloatArray, low: FloatArray, high: FloatArray, together: float) -> FloatArray:
@@ -167,6 +176,7 @@ def of_replays(job: Job) -> dict[str, dict[str, Any]]:
             found[name] = {
                 "teleports": teleports(angles),
                 "unusual": unusual(angles),
+                "twisted": twisted(angles),
                 "frames": len(angles.stamps_ns),
                 "cpu": spent / report.recording_s,
                 "speed": report.recording_s / report.elapsed_s,
@@ -199,7 +209,12 @@ def of_clip(job: Job) -> dict[str, dict[str, Any]]:
             np.stack([each.position for each in series]),
             np.stack([each.position_stddev for each in series]),
         )
-        found[name] = {"teleports": teleports(angles), "unusual": unusual(angles), "frames": len(series)}
+        found[name] = {
+            "teleports": teleports(angles),
+            "unusual": unusual(angles),
+            "twisted": twisted(angles),
+            "frames": len(series),
+        }
     return found
 
 
@@ -218,9 +233,10 @@ def summary(results: list[dict[str, dict[str, Any]]]) -> dict[str, dict[str, Any
             "frames": sum(each["frames"] for each in own),
             "teleports": sum(len(each["teleports"]) for each in own),
         }
-        shoulders, astray = (sum(each["unusual"][k] for each in own) for k in range(2))
-        if shoulders:
-            row["unusual"] = 100.0 * astray / shoulders
+        for column in ("unusual", "twisted"):
+            sure, astray = (sum(each[column][k] for each in own) for k in range(2))
+            if sure:
+                row[column] = 100.0 * astray / sure
         for column in ("cpu", "speed", "elevation", "plane", "elbow", "trunk"):
             values = [each[column] for each in own if column in each]
             if values:

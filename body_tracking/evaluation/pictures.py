@@ -145,12 +145,23 @@ def _unbroken(degrees: FloatArray) -> FloatArray:
     return curve
 
 
+def _with_gaps(times: FloatArray, *series: FloatArray) -> list[FloatArray]:
+    """Times (n,) and series (n, ...) with NaN at both ends of each gap, over which lines and cells would be drawn."""
+    if len(times) < 2:
+        return [times, *series]
+    gap = max(MAX_GAP, 2.0 * float(np.median(np.diff(times))))
+    after = np.repeat(np.flatnonzero(np.diff(times) > gap) + 1, 2)
+    ends = np.where(np.arange(len(after)) % 2, times[after] - gap / 3.0, times[after - 1] + gap / 3.0)
+    return [np.insert(times, after, ends), *(np.insert(each, after, np.nan, axis=0) for each in series)]
+
+
 def _draw_angles(figure: Any, angles: AngleComparison, still: float = _STILL) -> None:
     panels, shown = _panels(angles.names), _thin(len(angles.times))
     axes = figure.subplots(-(-len(panels) // _COLUMNS), _COLUMNS, sharex=True, squeeze=False)
-    times, stddev = angles.times[shown], angles.stddev[shown]
+    series = (angles.found, angles.true, angles.stddev)
+    times, found, true, stddev = _with_gaps(angles.times[shown], *(each[shown] for each in series))
     band = 1.96 * np.degrees(np.where(np.isfinite(stddev), stddev, np.nan))
-    found, true = np.degrees(angles.found[shown]), np.degrees(angles.true[shown])
+    found, true = np.degrees(found), np.degrees(true)
     for axis, (title, columns) in zip(axes.flat, panels.items(), strict=False):
         for column in columns:
             colour, curve = _COLOURS[_side(angles.names[column])], _unbroken(found[:, column])
@@ -245,11 +256,7 @@ def _errors(result: Evaluation) -> str:
     comparison = result.comparisons[0]
     joints, shown = np.flatnonzero(comparison.joints.frames), _thin(len(comparison.times))
     distances = 1e3 * np.linalg.norm(comparison.found - comparison.true, axis=-1)[shown][:, joints]
-    times = comparison.times[shown]
-    gap = max(MAX_GAP, 2.0 * float(np.median(np.diff(times))))
-    after = np.repeat(np.flatnonzero(np.diff(times) > gap) + 1, 2)  # gaps, which neighbouring cells would cover
-    edges = np.where(np.arange(len(after)) % 2, times[after] - gap / 3.0, times[after - 1] + gap / 3.0)
-    distances, times = np.insert(distances, after, np.nan, axis=0), np.insert(times, after, edges)
+    times, distances = _with_gaps(comparison.times[shown], distances)
     figure, rows = figure_of(5.0), range(len(joints))
     axis = figure.subplots()
     highest = max(float(np.nanpercentile(distances, 99.0)), 1.0)

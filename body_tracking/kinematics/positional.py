@@ -37,7 +37,7 @@ are about an axis that the positions do not determine: the standard deviation gr
 the deflection that gives the direction (the elevation, the elbow flexion) is not significant: less than 3.7 of its own
 standard deviations, which noise alone exceeds once in a thousand frames.
 
-A twist of shoulders against hips beyond 70 deg, the most that a person can, has the excess as an error of its own.
+A person can twist the shoulders against the hips by at most 70 deg. The excess of a larger angle is added to its error.
 
 Velocities are the Jacobian times the joint velocities. A skeleton has no covariance of its velocities; the stated
 deviation is a bound. For a point driven by white acceleration of density q, the velocity variance of a Kalman filter in

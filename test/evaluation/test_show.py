@@ -141,6 +141,19 @@ def test_an_angle_known_for_one_frame_is_a_dot(tmp_path: Path) -> None:
     assert dots.get_xydata().tolist() == [[1.0, pytest.approx(90.0)]]
 
 
+def test_no_line_is_drawn_over_a_gap_and_no_frame_is_lost() -> None:
+    times = np.concatenate([np.arange(30) / 30.0, 5.0 + np.arange(30) / 30.0, [9.0]])
+    angles, figure = series([20.0] * 61, [1.0] * 61), Figure()
+    nothing = np.full((61, 1), np.nan)
+    errors = angle_errors(angles.known, nothing, angles.stddev)
+    pictures._draw_angles(figure, AngleComparison(("knee",), times, angles.known, nothing, angles.stddev, errors))
+    curve, dots = figure.axes[0].lines[:2]
+    known = np.isfinite(curve.get_ydata())
+    assert_array_equal(curve.get_xdata()[known], times)
+    assert_allclose(curve.get_xdata()[~known], [29 / 30 + 0.05, 4.95, 5 + 29 / 30 + 0.05, 8.95])
+    assert dots.get_xdata().tolist() == [9.0]
+
+
 def test_a_truth_in_another_world_is_drawn_onto_the_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(1)
     states = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)

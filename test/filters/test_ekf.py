@@ -284,16 +284,20 @@ def test_another_person_of_another_size_is_learnt_anew() -> None:
     assert_allclose(known(estimator).lengths, 0.65 * truth.lengths, rtol=0.0, atol=0.02)
 
 
+def arm_elsewhere(rng: np.random.Generator) -> tuple[list[Joint], FloatArray]:
+    """The joints of an arm from the elbow on, and by how much a camera moves them, 0.35 m."""
+    offset = rng.normal(size=3)
+    side = rng.choice(["LEFT", "RIGHT"])
+    arm = [Joint[f"{joint}_{side}"] for joint in ("ELBOW", "WRIST", "HAND", "HAND_TIP", "THUMB")]
+    return arm, 0.35 * offset / np.linalg.norm(offset)
+
+
 def test_a_pose_that_jumps_states_how_far() -> None:
     """After a jump the deviations say that either pose may be wrong: a camera moves an arm elsewhere for 0.6 s."""
     jumps, misleading = 0, 0
     for seed in range(draws(10, 60)):
-        rng = np.random.default_rng([seed, 7])
         truth = random_truth(seed, 3.2)
-        offset = rng.normal(size=3)
-        offset *= 0.35 / np.linalg.norm(offset)
-        side = rng.choice(["LEFT", "RIGHT"])
-        arm = [Joint[f"{joint}_{side}"] for joint in ("ELBOW", "WRIST", "HAND", "THUMB")]
+        arm, offset = arm_elsewhere(np.random.default_rng([seed, 7]))
         estimator, angles = ExtendedKalmanFilter(), None
         found = []
         for skeleton, time in zip(measured(truth).skeletons, truth.times, strict=True):
@@ -308,7 +312,7 @@ def test_a_pose_that_jumps_states_how_far() -> None:
         far = np.abs(wrapped(np.diff(position, axis=0))) > np.radians(60.0)
         jumps += int(far.sum())
         misleading += int((far & (np.maximum(stddev[1:], stddev[:-1]) < np.radians(15.0))).sum())
-    # 1 of 179: the shoulder's angles of the other arm go over to the equivalent triple, by 106 degrees in one of them
+    # 2 of 188 over 60 people: a shoulder's angles switch to the equivalent triple
     assert jumps >= 10 and misleading <= 0.02 * jumps, (jumps, misleading)
 
 
@@ -316,12 +320,8 @@ def test_one_sensor_that_sees_an_arm_elsewhere_does_not_move_it_there() -> None:
     """A camera at the side guesses a hidden arm; only that camera sees the hand, so that a new pose is searched for."""
     away, restarts = [], 0
     for seed in range(draws(4, 20)):
-        rng = np.random.default_rng([seed, 8])
         truth = random_truth(seed, 4.0)
-        offset = rng.normal(size=3)
-        offset *= 0.35 / np.linalg.norm(offset)
-        side = rng.choice(["LEFT", "RIGHT"])
-        arm = [Joint[f"{joint}_{side}"] for joint in ("ELBOW", "WRIST", "HAND", "HAND_TIP", "THUMB")]
+        arm, offset = arm_elsewhere(np.random.default_rng([seed, 8]))
         estimator = ExtendedKalmanFilter()
         frames = zip(measured(truth).skeletons, measured(truth, seed=1).skeletons, truth.times, strict=True)
         for number, (front, beside, time) in enumerate(frames):

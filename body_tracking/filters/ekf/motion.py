@@ -95,7 +95,7 @@ class Motion:
             velocity=fade * state.velocity,
             covariance=p,
             crosses=crosses,
-            corrected=believed * state.corrected,
+            jump=believed * state.jump,
             since_prior=state.since_prior + dt,
             tracked=state.tracked + dt,
             fresh=False,

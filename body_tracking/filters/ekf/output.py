@@ -63,7 +63,7 @@ class Output:
                 held = covariance - free
                 q = self._upright(q, state.lengths, free)
                 covariance = free + held
-            covariance[pose, pose] += np.outer(disputed, disputed) + np.outer(state.corrected, state.corrected)
+            covariance[pose, pose] += np.outer(disputed, disputed) + np.outer(state.jump, state.jump)
             self._last_handed_out = state, q, covariance
         return self._last_handed_out[1:]
 

@@ -214,18 +214,19 @@ class PoseSearch:
             self._counters["restarts"] += 1
             seen = SegmentLengths(self._parameters.slow_time) if state.settled else state.seen
             state = state.but(settled=False, tracked=0.0, seen=seen)
-            started = self.new_state(state.stamp_ns, fresh.q, lengths, stddev, state, keep_lengths=False)
-            return started.but(corrected=self._change(state, started))
+            return self._jumped(
+                state, self.new_state(state.stamp_ns, fresh.q, lengths, stddev, state, keep_lengths=False)
+            )
         if fit.cost > share * present:
             return state
         self._counters["restarts"] += 1
         fit = self.inverse.solve(points, stddev, state.lengths, fit.q)
-        started = self.new_state(state.stamp_ns, fit.q, state.lengths, stddev, state)
-        return started.but(corrected=self._change(state, started))
+        return self._jumped(state, self.new_state(state.stamp_ns, fit.q, state.lengths, stddev, state))
 
-    def _change(self, before: State, after: State) -> FloatArray:
-        """(53,) change of tangent and lengths, for ``State.corrected``."""
-        return np.concatenate([self._model.difference(before.q, after.q), after.lengths - before.lengths])
+    def _jumped(self, before: State, after: State) -> State:
+        """The state after a restart, with the change as its ``jump``."""
+        change = self._model.difference(before.q, after.q), after.lengths - before.lengths
+        return after.but(jump=np.concatenate(change))
 
     def _lengths_of(self, points: FloatArray) -> FloatArray:
         """(21,) metres: average proportions, scaled to the size of the observed person."""

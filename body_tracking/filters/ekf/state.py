@@ -99,7 +99,7 @@ class State(Changeable):
         rejected_for: (19,) seconds for which each point has been rejected.
         disputed: (57,) metres, innovations of rejected points, times the square root of the share of the time after
             which another pose is searched for; 0 of accepted points.
-        corrected: (53,) change of tangent and lengths by the last restart of the pose: either pose may be wrong. It
+        jump: (53,) change of tangent and lengths by the last restart of the pose: either pose may be wrong. It
             fades with ``reacquire_after``, while frames confirm the new one.
         used_ns: (19,) stamp of the last accepted measurement of each point.
         since_prior: seconds since ranges of motion were last applied.
@@ -126,7 +126,7 @@ class State(Changeable):
     crosses: SingleArray
     rejected_for: FloatArray
     disputed: FloatArray
-    corrected: FloatArray
+    jump: FloatArray
     used_ns: IntArray
     since_prior: float
     tracked: float
