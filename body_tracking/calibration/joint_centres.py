@@ -9,10 +9,14 @@ symmetric, up to the person's own deviation from it.
 With measured joints ``m = p + b + e`` in the axes of the measured thorax, ``p`` the anatomical ones, ``b ~ N(0, P)``
 the constant offsets and ``e ~ N(0, T)`` the transient error, and a pose with ``H p = c + w``, ``w ~ N(0, R)``, in the
 body's own axes, which are rotated by some small ``a ~ N(0, A)`` against those, so that ``H (p + a x p) = c + w``, the
-offsets are (conditional normal distribution; ``G a = -H (a x m)``)
+offsets are (``G a = -H (a x m)``)
 
-    r = H m - c,  S = H (P + T) H^T + G A G^T + R                                                                  (1)
-    b = P H^T S^-1 r,  Cov(b) = P - P H^T S^-1 H P                                                                 (2)
+    r = H m - c,  N = H T H^T + G A G^T + R,  S = H D H^T + N,  K = D H^T S^-1                                     (1)
+    b = K r,  Cov(b) = (I - K H) P (I - K H)^T + K N K^T                                                           (2)
+
+``D`` is the diagonal of ``P``. Neighbouring joints' offsets are correlated (``core.measurement.offset_correlation``),
+which their remaining covariance (2) regards and the gain does not: with ``P`` in place of ``D`` elbows err by 7.8
+instead of 7.2 degrees (16 simulated people), and are covered in 93 instead of 96 % of the frames.
 
 Only combinations that the pose determines become observable; the place of the whole arm does not. For a T-pose,
 ``r^T S^-1 r`` is chi-square with as many degrees of freedom as (1) has rows.
@@ -45,7 +49,7 @@ import numpy as np
 
 from body_tracking.calibration.still_pose import is_t_pose
 from body_tracking.core.chi_square import gate
-from body_tracking.core.measurement import BASE_STDDEV
+from body_tracking.core.measurement import BASE_STDDEV, offset_correlation
 from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, IntArray, Joint, Skeleton
 
 _J = Joint
@@ -112,6 +116,12 @@ _AXES_STDDEV = 0.3
 _UNSEEN = 1.0
 """Square metres: variance of a joint that is not seen."""
 
+_PRIOR: FloatArray = np.kron(offset_correlation() * BASE_STDDEV * BASE_STDDEV[:, None], np.eye(3)).astype(np.float64)
+"""(75, 75) square metres: covariance of the offsets of all joints before a T-pose."""
+_ROWS = (3 * LEARNT[:, None] + np.arange(3)).reshape(-1)
+_FRAMES = np.full(N_JOINTS, _PLACE[_J.SPINE_BASE])
+"""(25,) place in ``LEARNT`` of the joint whose segment's frame a joint's offset is in."""
+_FRAMES[_MOVED] = _MOVED_AS
 _CORRELATION = np.eye(len(LEARNT))
 for _arm in _CHAINS:
     _CORRELATION[np.ix_(_arm, _arm)] += _ARM_CORRELATION * (1.0 - np.eye(len(_arm)))
@@ -123,15 +133,13 @@ class Offsets:
 
     Attributes:
         local: (11, 3) metres from the anatomical to the measured joints, in the frames of the segments.
-        covariance: (33, 33) of these.
-        share: largest remaining share of the variance of an arm's angle that offsets cause.
+        covariance: (75, 75) of the offsets of all joints.
         distance: ``r^T S^-1 r``.
         dimension: its expectation for a T-pose.
     """
 
     local: FloatArray
     covariance: FloatArray
-    share: float
     distance: float
     dimension: int
 
@@ -250,63 +258,65 @@ def t_pose_offsets(positions: FloatArray, transient: FloatArray) -> Offsets:
         transient: (11,) square metres per axis: variance of the transient error of the joints ``LEARNT``.
     """
     points = positions[LEARNT]
-    rows, wanted, stddev, angles = _t_pose(points)  # H, c, square root of R
+    rows, wanted, stddev = _t_pose(points)  # H, c, square root of R
     prior = np.repeat(BASE_STDDEV[LEARNT] ** 2, 3)
     residual = rows @ points.reshape(-1) - wanted
     passing = np.kron(_CORRELATION * np.sqrt(np.outer(transient, transient)), np.eye(3))
     # h . (a x m) = a . (m x h), summed over the joints
     turning = np.cross(points, rows.reshape(len(rows), -1, 3)).sum(axis=1)
     axes = _AXES_STDDEV**2 * turning @ turning.T
-    innovation = (rows * prior + rows @ passing) @ rows.T + axes + np.diag(stddev**2)
-    gain = np.linalg.solve(innovation, rows * prior)  # S^-1 H P
-    offsets = (residual @ gain).reshape(-1, 3)
-    covariance = np.diag(prior) - (rows * prior).T @ gain
-    left = np.einsum("ij,jk,ik->i", angles, covariance, angles) / (angles**2 @ prior)
+    noise = rows @ passing @ rows.T + axes + np.diag(stddev**2)
+    innovation = (rows * prior) @ rows.T + noise
+    gain = np.linalg.solve(innovation, rows * prior).T  # K
+    offsets = (gain @ residual).reshape(-1, 3)
+    of_all = np.zeros((N_JOINTS, 3, len(rows)))
+    of_all[_MOVED] = gain.reshape(len(LEARNT), 3, -1)[_MOVED_AS]
+    gains = of_all.reshape(3 * N_JOINTS, -1)
+    kept = np.eye(3 * N_JOINTS)
+    kept[:, _ROWS] -= gains @ rows
+    covariance = kept @ _PRIOR @ kept.T + gains @ noise @ gains.T
     # from the axes of the thorax into those of the segments
     frames = posed(positions, np.broadcast_to(np.eye(3), (len(LEARNT), 3, 3)).copy())  # rows: the frames' axes
     local = np.einsum("jab,jb->ja", frames, offsets)
-    blocks = np.einsum("iab,ibjc,jdc->iajd", frames, covariance.reshape(len(LEARNT), 3, len(LEARNT), 3), frames)
+    frames = frames[_FRAMES]
+    blocks = np.einsum("iab,ibjc,jdc->iajd", frames, covariance.reshape(N_JOINTS, 3, N_JOINTS, 3), frames)
     distance = float(residual @ np.linalg.solve(innovation, residual))
-    return Offsets(local, blocks.reshape(covariance.shape), float(left.max()), distance, len(rows))
+    return Offsets(local, blocks.reshape(covariance.shape), distance, len(rows))
 
 
-def _t_pose(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """The constraints of a T-pose on (11, 3) points: rows H (n, 33), c and sqrt(R) (n,); and rows (8, 33) of angles."""
+def _t_pose(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The constraints of a T-pose on (11, 3) points: rows H (n, 33), c and sqrt(R) (n,)."""
     rows: list[FloatArray] = []
     values: list[float] = []
     stddev: list[float] = []
-    angles: list[FloatArray] = []
     forward, left, up = range(3)
 
-    def add_row(axis: int, value: float, deviation: float, *terms: tuple[Joint, float]) -> FloatArray:
+    def add_row(axis: int, value: float, deviation: float, *terms: tuple[Joint, float]) -> None:
         row = np.zeros(points.shape)
         for joint, factor in terms:
             row[_PLACE[joint], axis] += factor
         rows.append(row)
         values.append(value)
         stddev.append(deviation)
-        return row
 
     def length(start: Joint, end: Joint) -> float:
         return float(np.linalg.norm(points[_PLACE[end]] - points[_PLACE[start]]))
 
     base, middle, top = _TRUNK
-    thorax, width = length(middle, top), length(_LEFT[0], _RIGHT[0])
-    for sign, arm, other in ((1.0, _LEFT, _RIGHT), (-1.0, _RIGHT, _LEFT)):
+    width = length(_LEFT[0], _RIGHT[0])
+    for arm, other in ((_LEFT, _RIGHT), (_RIGHT, _LEFT)):
         shoulder, elbow, wrist, hand = arm
         upper, fore, palm = length(shoulder, elbow), length(elbow, wrist), length(wrist, hand)
         # plane of elevation: the upper arm continues the line of the shoulders
         ratio = upper / width
         terms = (elbow, 1.0), (shoulder, -1.0 - ratio), (other[0], ratio)
-        angles.append(add_row(forward, 0.0, upper * POSE_STDDEV, *terms))
-        # elevation: perpendicular to the thorax, whose lean follows from the sideways offsets of its ends
-        row = add_row(up, 0.0, upper * POSE_STDDEV, (elbow, 1.0), (shoulder, -1.0)).copy()
-        row[_PLACE[top], left], row[_PLACE[middle], left] = sign * upper / thorax, -sign * upper / thorax
-        angles.append(row)
+        add_row(forward, 0.0, upper * POSE_STDDEV, *terms)
+        # elevation: perpendicular to the thorax
+        add_row(up, 0.0, upper * POSE_STDDEV, (elbow, 1.0), (shoulder, -1.0))
         for axis, bend, deviation in ((forward, _STRAIGHT_ELBOW, _STRAIGHT_ELBOW), (up, 0.0, POSE_STDDEV)):
             ratio = fore / upper
             terms = (wrist, 1.0), (elbow, -1.0 - ratio), (shoulder, ratio)
-            angles.append(add_row(axis, fore * bend, fore * deviation, *terms))
+            add_row(axis, fore * bend, fore * deviation, *terms)
             ratio = palm / fore
             add_row(axis, 0.0, 2.0 * palm * POSE_STDDEV, (hand, 1.0), (wrist, -1.0 - ratio), (elbow, ratio))
     for start, end in zip(range(3), range(1, 4), strict=True):
@@ -321,7 +331,6 @@ def _t_pose(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, Flo
         np.array(rows).reshape(len(rows), -1),
         np.array(values),
         np.array(stddev),
-        np.array(angles).reshape(len(angles), -1),
     )
 
 
@@ -484,19 +493,18 @@ class JointCentres:
 
     def spread(self, positions: FloatArray, stamp_ns: int) -> FloatArray:
         """(75, 75) covariance of the remaining offsets, in the axes of (25, 3) positions."""
-        result = np.repeat(BASE_STDDEV**2, 3)[:, None] * np.eye(3 * N_JOINTS)
         if self.offsets is None:
-            return result
-        count = len(LEARNT)
-        frames = posed(positions, np.broadcast_to(np.eye(3), (count, 3, 3)).copy())
+            return _PRIOR
+        frames = posed(positions, np.broadcast_to(np.eye(3), (len(LEARNT), 3, 3)).copy())[_FRAMES]
         if not np.isfinite(frames).all():
-            return result
-        blocks = np.einsum("iba,ibjc,jcd->iajd", frames, self.offsets.covariance.reshape(count, 3, count, 3), frames)
-        share = retained(positions).repeat(3)
-        progress = self._progress(self._first_ns, stamp_ns) * share * share[:, None]
-        places = (3 * LEARNT[:, None] + np.arange(3)).reshape(-1)
-        learnt = np.ix_(places, places)
-        result[learnt] += progress * (blocks.reshape(3 * count, 3 * count) - result[learnt])
+            return _PRIOR
+        known = self.offsets.covariance.reshape(N_JOINTS, 3, N_JOINTS, 3)
+        blocks = np.einsum("iba,ibjc,jcd->iajd", frames, known, frames).reshape(_PRIOR.shape)
+        share = np.ones(N_JOINTS)
+        share[_MOVED] = retained(positions)[_MOVED_AS]
+        progress = self._progress(self._first_ns, stamp_ns) * share**2
+        old, new = (np.sqrt(each).repeat(3) for each in (progress, 1.0 - progress))
+        result: FloatArray = old * old[:, None] * blocks + new * new[:, None] * _PRIOR  # eq. (3)
         return result
 
 
