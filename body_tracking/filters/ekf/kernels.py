@@ -121,6 +121,20 @@ def point_covariances(observation: FloatArray, covariance: FloatArray) -> FloatA
 
 
 @compiled
+def _by_points(crosses: SingleArray, place: int, own: FloatArray) -> FloatArray:
+    """(n, 57) covariance of the state with the points' slow errors of the sensor at a place of ``crosses``."""
+    size = 3 * len(own)
+    result = np.zeros((len(crosses), size))
+    for point in range(len(own)):
+        for j in range(point + 1):
+            if own[point, j] != 0.0:
+                for row in range(len(crosses)):
+                    for i in range(3):
+                        result[row, 3 * point + i] += own[point, j] * crosses[row, place + 3 * j + i]
+    return result
+
+
+@compiled
 def expected(
     q: FloatArray,
     lengths: FloatArray,
@@ -146,7 +160,7 @@ def expected(
         spread: (32, 32) covariance of the tangent, for the second-order terms.
         crosses: (n, m) covariance of the state with the slow errors of all sensors.
         place: first column of this sensor's slow errors.
-        own: (19,) metres: standard deviation of the points' slow errors.
+        own: (19, 19) metres: the points' slow errors by independent ones of unit variance, lower triangular.
         along: (4,) standard deviation of each limb's measured length, as a share of the length; 0 for none.
         carried: (19, 4) which points each limb carries.
         white: (19,) square metres: variance of the white noise.
@@ -188,19 +202,23 @@ def expected(
     half = 0.5 * cross[:known]
     # H P H^T + B C^T H^T + H C B^T + B B^T, and P H^T + C B^T
     by_limbs = np.dot(crosses[:, place + size : place + size + limbs.shape[1]].astype(np.float64), limbs.T)
+    by_points = _by_points(crosses, place, own)
     for row in range(len(cross)):
         for k in range(size):
-            change = crosses[row, place + k] * own[k // 3] + by_limbs[row, k]
+            change = by_points[row, k] + by_limbs[row, k]
             cross[row, k] += change
             if row < known:
                 half[row, k] += change
     product = np.dot(observation, half)
     s = np.dot(limbs, limbs.T)
+    variance = np.dot(own, own.T)
     blocks = np.empty((count, 3, 3))
     for i in range(size):
         for j in range(size):
             s[i, j] += product[i, j] + product[j, i]
-        s[i, i] += white[i // 3] + own[i // 3] * own[i // 3]
+        s[i, i] += white[i // 3]
+        for j in range(i % 3, size, 3):
+            s[i, j] += variance[i // 3, j // 3]
     for point in range(count):
         for i in range(3):
             for j in range(3):
@@ -264,7 +282,7 @@ def crosses_updated(
         observation: (57, 53) derivative of the points.
         rows: (k,) rows of ``observation`` that were used.
         place: first column of this sensor's slow errors.
-        own: (19,) metres: standard deviation of the points' slow errors.
+        own: (19, 19) metres: the points' slow errors by independent ones of unit variance, lower triangular.
         limbs: (57, 4) displacement by one standard deviation of each limb's length.
     """
     known, size = observation.shape[1], len(observation)
@@ -273,7 +291,10 @@ def crosses_updated(
     by_limbs = np.dot(kalman, limbs[rows])
     for i in range(len(result)):
         for k in range(len(rows)):
-            result[i, place + rows[k]] -= kalman[i, k] * own[rows[k] // 3]
+            point, axis = rows[k] // 3, rows[k] % 3
+            for j in range(point + 1):
+                if own[point, j] != 0.0:
+                    result[i, place + 3 * j + axis] -= kalman[i, k] * own[point, j]
         for k in range(limbs.shape[1]):
             result[i, place + size + k] -= by_limbs[i, k]
     return result

@@ -190,14 +190,14 @@ class SkeletonUpdate:
             seen.observation,
             rows,
             place,
-            self._sensors.slow_stddev(sensor, measurement)[0],
+            self._sensors.slow_errors(sensor, measurement, state.sources)[0],
             seen.limbs,
         )
         for ball, turn in turns:
             crosses[ball] = turn @ crosses[ball]
         foreseeable = float(predicted_variance.max()) < _FORESEEABLE**2
         slow_scale, slow_estimate, information = (
-            self._sensors.slow_learnt(sensor, measurement, whitening, white, rows, bool(state.sources.names))
+            self._sensors.slow_learnt(sensor, measurement, whitening, white, rows, state.sources)
             if foreseeable  # otherwise the linearisation errs by more than the sensor
             else (sensor.slow, sensor.slow_estimate, sensor.slow_information)
         )
@@ -251,7 +251,7 @@ class SkeletonUpdate:
         turns = np.zeros((0, 3, 3))
         if correction is not None:  # derivatives by the tangent at the state
             turns = so3.right_jacobian(correction[self._model.ball_v])
-        own, along = self._sensors.slow_stddev(sensor, measurement)
+        own, along = self._sensors.slow_errors(sensor, measurement, state.sources)
         found = _Expected(
             *expected(
                 q,
