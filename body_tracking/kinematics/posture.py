@@ -12,7 +12,7 @@ three shipped recordings, which are simulated. Figures over these recordings are
   et al., Eur. Spine J. 20 Suppl. 5 (2011) 572, 709 people); a forward bend is at first twice as large in the lumbar
   spine as in the hips, and less later (Esola et al., Spine 21 (1996) 71), so that both get the same deviation
 - the others: a share of the range to one side in :mod:`body_tracking.kinematics.ranges`, whose sources stand there; a
-  third for lateral bending* and the neck, half for axial rotation, a quarter for the clavicle
+  third for lateral bending* and the neck, half for axial rotation and the clavicle
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ STDDEV: dict[str, float] = {
     "thoracic_axial": 20.0,
     "neck_flexion": 20.0,
     "neck_lateral": 15.0,
-    "clavicle_protraction": 8.0,
-    "clavicle_elevation": 8.0,
+    "clavicle_protraction": 16.0,
+    "clavicle_elevation": 16.0,
 }
 """Degrees about zero."""
 
