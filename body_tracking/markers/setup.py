@@ -90,8 +90,10 @@ def sources_in(folder: Path) -> tuple[tuple[str, ...], ...]:
     Without a rig, only points, which then come from another motion capture system.
 
     Raises:
-        SetupError: as :func:`camera_names`.
+        SetupError: no such folder, or as :func:`camera_names`.
     """
+    if not folder.expanduser().is_dir():
+        raise SetupError(f"{folder}: no such folder")
     if not (folder.expanduser() / RIG).is_file():
         return ((POINTS,),)
     return sources(camera_names(folder))

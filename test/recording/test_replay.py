@@ -501,6 +501,7 @@ def test_sensors_none_leaves_out_the_skeletons_of_a_bag(tmp_path: Path, command:
     setup = Path(__file__).resolve().parents[2] / "config" / "marker_setup"
     for more, message in (
         ((), "no sensors"),
+        (("--marker-setup", "nowhere"), "nowhere: no such folder"),
         (("--marker-setup", setup), "no topic /left/image_raw or /left/balls or /markers/points"),
     ):
         code, _, reported = command("replay", BAG, "-o", tmp_path / "out", "--sensors", "none", *more)
