@@ -14,9 +14,9 @@ offsets are (``G a = -H (a x m)``)
     r = H m - c,  N = H T H^T + G A G^T + R,  S = H D H^T + N,  K = D H^T S^-1                                     (1)
     b = K r,  Cov(b) = (I - K H) P (I - K H)^T + K N K^T                                                           (2)
 
-``D`` is the diagonal of ``P``. Neighbouring joints' offsets are correlated (``core.measurement.offset_correlation``),
-which their remaining covariance (2) regards and the gain does not: with ``P`` in place of ``D`` elbows err by 7.8
-instead of 7.2 degrees (16 simulated people), and are covered in 93 instead of 96 % of the frames.
+``D`` is the diagonal of ``P``. Neighbouring joints' offsets are correlated (``core.measurement.offset_correlation``).
+The covariance (2) accounts for that; the gain does not: with ``P`` in place of ``D`` elbows err by 7.8 instead of 7.2
+degrees (16 simulated people), and are covered in 93 instead of 96 % of the frames.
 
 Only combinations that the pose determines become observable; the place of the whole arm does not. For a T-pose,
 ``r^T S^-1 r`` is chi-square with as many degrees of freedom as (1) has rows.
@@ -327,11 +327,7 @@ def _t_pose(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         add_row(axis, 0.0, _SYMMETRY_STDDEV, (shoulders[0], 1.0), (shoulders[1], -1.0))
     for joint in (base, middle, top):
         add_row(left, 0.0, _SYMMETRY_STDDEV, (shoulders[0], 0.5), (shoulders[1], 0.5), (joint, -1.0))
-    return (
-        np.array(rows).reshape(len(rows), -1),
-        np.array(values),
-        np.array(stddev),
-    )
+    return np.array(rows).reshape(len(rows), -1), np.array(values), np.array(stddev)
 
 
 _LONG_AGO_NS = -(2**62)

@@ -43,11 +43,11 @@ bones have better directions than independent joints would give. With this value
 elbow match the errors of a Kinect v2 against Vicon that remain after the correction of the arms' directions, in people
 to whom the correction was not fitted (``benchmarks/kinect_vs_vicon.py --fit``)."""
 
-GIRDLE_CORRELATION = 0.74
-"""Correlation of the errors of the left and the right shoulder, and of both hips. With this value the twist between
-shoulders and hips errs by 11 degrees if both joints have the deviations of ``BASE_STDDEV`` times 1.2; independent ones
-would give 21. A Kinect v2 shows people who face it and move an arm (54 clips of UI-PRMD) with twists of 4 to 15 degrees
-between the clips of one person."""
+GIRDLE_CORRELATION = BONE_CORRELATION**2
+"""Correlation of the errors of the left and the right shoulder, and of both hips: two bones lie between them. With this
+value the twist between shoulders and hips has a deviation of 11 degrees if all four joints have that of ``BASE_STDDEV``
+times 1.2; independent joints would give 21. A Kinect v2 shows people who face it and move an arm (54 clips of UI-PRMD)
+with twists whose deviation between the clips of one person is 4 to 15 degrees."""
 
 _LEFT_ENDS = np.array([Joint.SHOULDER_LEFT, Joint.HIP_LEFT], dtype=np.intp)
 _RIGHT_ENDS = np.array([Joint.SHOULDER_RIGHT, Joint.HIP_RIGHT], dtype=np.intp)

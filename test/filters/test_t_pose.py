@@ -115,6 +115,7 @@ def test_they_are_not_too_sure_of_where_arms_point(name: str) -> None:
     alone = {"posture": False} if name == "ekf" else {}
     errors, stddev = run(make_filter(name, **alone), HOLDING, angles=ARMS)
     _, unsure = run(make_filter(name, t_pose=False, **alone), HOLDING, angles=ARMS)
+    # the offsets of neighbouring joints are correlated before and after the pose, so that it tells less: 0.86
     assert np.median(stddev) < (0.9 if name == "ekf" else 1.02) * np.median(unsure)
     assert (np.abs(errors) < 1.96 * stddev).all()
 
