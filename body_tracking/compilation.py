@@ -35,6 +35,11 @@ def run(args: argparse.Namespace) -> int:
 
 def _seconds(function: str) -> float:
     """Seconds that ``module:function`` takes."""
+    from numba.core import event  # half a second, which the parser of the commands cannot wait for
+
+    from body_tracking.core.compiled import NOTICE
+
+    event.unregister("numba:compile", NOTICE)  # type: ignore[no-untyped-call]
     began = time.perf_counter()
     load(function)()
     return time.perf_counter() - began

@@ -38,11 +38,16 @@ def cache(tmp_path: Path) -> Path:
 
 def run(folder: Path, cache: Path) -> str:
     """The value of ``outer(1)`` in a new process, and whether its code came from the cache."""
+    return execute(_SCRIPT, folder, cache).stdout
+
+
+def execute(script: str, folder: Path, cache: Path) -> subprocess.CompletedProcess[str]:
+    """A script in a new process that finds the modules of a folder."""
     path = os.pathsep.join([str(folder), *filter(None, sys.path)])
     # Python's own cache treats a file of equal size and time in seconds as unchanged
     environment = {**os.environ, "PYTHONPATH": path, "XDG_CACHE_HOME": str(cache), "PYTHONDONTWRITEBYTECODE": "1"}
-    command = [sys.executable, "-c", _SCRIPT]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PATIENCE, check=True).stdout
+    command = [sys.executable, "-c", script]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PATIENCE, check=True)
 
 
 def write(folder: Path, offset: float = 1.0, factor: float = 1.0) -> None:
@@ -78,3 +83,11 @@ def test_without_a_folder_to_write_to_it_runs_all_the_same(tmp_path: Path) -> No
     write(tmp_path / "one")
     (tmp_path / "file").touch()
     assert run(tmp_path / "one", tmp_path / "file").split() == ["2.0", "0"]
+
+
+def test_a_user_reads_why_a_program_waits_while_it_compiles(tmp_path: Path, cache: Path) -> None:
+    write(tmp_path)
+    script = "from body_tracking.core import compiled; compiled.QUIET = {}; from outer import outer; outer(1.0)"
+    assert execute(script.format(1000.0), tmp_path, tmp_path / "other cache").stderr == ""  # takes less than that
+    assert execute(script.format(0.0), tmp_path, cache).stderr.startswith("compiling loops, once for each version")
+    assert execute(script.format(0.0), tmp_path, cache).stderr == ""  # nothing is left to compile

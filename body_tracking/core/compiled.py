@@ -9,12 +9,15 @@ import contextlib
 import hashlib
 import os
 import shutil
+import sys
+import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
+from numba.core import event
 from numba.core.caching import UserWideCacheLocator
 
 from body_tracking.core.files import user_cache
@@ -29,6 +32,36 @@ _VERSIONS_KEPT = 4
 
 _digests: dict[str, str] = {}
 """Digest of each module that has compiled functions, by the module's name."""
+
+
+QUIET = 2.0
+"""Seconds of compiling after which the user reads why the program waits."""
+
+
+class CompilingNotice(event.Listener):
+    """Prints one line to stderr where a process compiles for long; loading from the cache prints nothing."""
+
+    def __init__(self) -> None:
+        """Nothing has been compiled yet."""
+        self._seconds = 0.0
+        self._starts: list[float] = []
+
+    def on_start(self, event: Any) -> None:
+        """A loop is about to be compiled, perhaps for another one that is being compiled."""
+        self._starts.append(time.monotonic())
+
+    def on_end(self, event: Any) -> None:
+        """A loop has been compiled."""
+        took = time.monotonic() - self._starts.pop()
+        if self._starts:
+            return  # its time is part of the outer loop's
+        if self._seconds <= QUIET < self._seconds + took:
+            print("compiling loops, once for each version: this may take a minute", file=sys.stderr, flush=True)
+        self._seconds += took
+
+
+NOTICE = CompilingNotice()
+event.register("numba:compile", NOTICE)  # type: ignore[no-untyped-call]
 
 
 def compiled(function: _Function) -> _Function:
