@@ -609,6 +609,27 @@ def test_missing_joints_are_predicted_and_come_back(missing: tuple[Joint, ...]) 
     assert_sound(outputs, estimator)
 
 
+def test_an_elbow_that_swings_twice_a_second_does_not_lag() -> None:
+    """With the same density of the acceleration at every speed it erred by 11.8 degrees RMS, at speed by 15.3."""
+    elbow = MODEL.coordinate_names.index("elbow_flexion_right")
+    times = capture_times(4.0, np.random.default_rng(17))
+    rate, tangent = np.zeros((2, len(times), MODEL.nv))
+    tangent[:, elbow] = np.radians(60.0 - 50.0 * np.cos(4.0 * np.pi * times))
+    rate[:, elbow] = np.radians(50.0) * 4.0 * np.pi * np.sin(4.0 * np.pi * times)
+    q, lengths = MODEL.integrate(MODEL.neutral(), tangent), MODEL.default_lengths()
+    positions = MODEL.forward(q, lengths).positions
+    truth = Truth(times, q, rate, lengths, positions, np.zeros(positions.shape[:2]))
+    place = elbow + 3  # in the configuration, where three rotations before it are quaternions
+    estimator = ExtendedKalmanFilter()
+    flexion = []
+    for skeleton in measured(truth, 0.005).skeletons:
+        estimator.take(skeleton)
+        flexion.append(np.nan if estimator.estimate is None else estimator.estimate.q[place])
+    off = np.degrees(np.array(flexion) - q[:, place])[times > SETTLED]
+    fast = np.abs(rate[times > SETTLED, elbow]) > np.radians(400.0)
+    assert rms(off) < 4.0 and rms(off[fast]) < 4.0
+
+
 # --- bad data
 
 

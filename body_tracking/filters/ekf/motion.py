@@ -15,9 +15,10 @@ from body_tracking.filters.ekf.state import State, StateSpace
 
 _SIDES, _ARM = ("left", "right"), ("shoulder", "elbow", "forearm", "wrist")
 _OF_SPEED = 16.0
-"""1/s: with orientations, additional density of a joint's acceleration per square of its speed. A limb swung twice a
-second accelerates by 4 pi times its speed for about a tenth of a second; with too small a density the lag would be
-attributed to errors of the sources."""
+"""1/s: additional density of the acceleration, per square of the joint's speed, of elbows and of joints that turn a
+segment whose orientation is measured. A limb swung twice a second accelerates by 4 pi times its speed for about a tenth
+of a second; with too small a density fast elbows lag by 60 ms, and the lag of a measured segment would be attributed to
+errors of its source. Shoulders are too noisy about the upper arm's axis (people who walk err more with it)."""
 _DOUBT_TIME = 0.65
 """Seconds: decay time of the evidence of frames that contradict the state; successive frames share their errors."""
 _DENSITY = {
@@ -50,6 +51,7 @@ class Motion:
         self._quick = self._quick_table()
         self._swift = self._quick.copy()
         self._swift[:, :6] = False
+        self._elbows = np.array([name.startswith("elbow") for name in self._model.coordinate_names])
 
     def predicted(self, state: State, stamp_ns: int) -> State:
         """A state predicted to a time by the motion model (integrated Ornstein-Uhlenbeck velocity)."""
@@ -59,13 +61,12 @@ class Motion:
             return state
         tau = self._parameters.velocity_time
         fade, reach = self._faded(dt)
-        density = self._density
+        density, swift = self._density, self._elbows
         if state.sources.names:
-            speeds = self._same_joint @ (state.velocity * state.velocity)
-            density = density.copy()
             quick = self._quick[state.sources.segments].any(axis=0)
-            density[quick] = np.maximum(density[quick], _BESIDE_ORIENTATIONS)
-            density += _OF_SPEED * self._swift[state.sources.segments].any(axis=0) * speeds
+            density = np.where(quick, np.maximum(density, _BESIDE_ORIENTATIONS), density)
+            swift = swift | self._swift[state.sources.segments].any(axis=0)
+        density = density + _OF_SPEED * swift * (self._same_joint @ (state.velocity * state.velocity))
         step = reach * state.velocity
         q = self._model.integrate(state.q, step)
 
