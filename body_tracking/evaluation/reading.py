@@ -360,7 +360,7 @@ def read_truth(path: Path, body: str | None = None) -> Recorded:
         EvaluationError: it holds no true skeletons.
     """
     with RigReader(path) as bag:
-        advice = "; the truth is a bag from a simulation or what replay made of it"
+        advice = "; --truth names a recording with the truth or another estimate, --help says which kinds"
         ids = (body,) if body is not None else bodies(bag)
         return replace(
             _recorded(bag, graph.TRUE_SKELETON, advice),

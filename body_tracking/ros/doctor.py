@@ -196,5 +196,5 @@ def run(args: argparse.Namespace) -> int:
         print(f"{finding.level:8} {finding.found}", flush=True)
         if finding.remedy:
             print(f"      -> {finding.remedy}")
-    print(f"\n{counts[PROBLEM]} problems, {counts[WARNING]} warnings, {counts[OK]} OK")
+    print(f"\nproblems: {counts[PROBLEM]}, warnings: {counts[WARNING]}, OK: {counts[OK]}")
     return 1 if counts[PROBLEM] else 0
