@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from body_tracking.systems import SYSTEMS
 from patience import PATIENCE
 
 _USER = """
@@ -91,3 +92,12 @@ def test_a_user_reads_why_a_program_waits_while_it_compiles(tmp_path: Path, cach
     assert execute(script.format(1000.0), tmp_path, tmp_path / "other cache").stderr == ""  # takes less than that
     assert execute(script.format(0.0), tmp_path, cache).stderr.startswith("compiling loops, once for each version")
     assert execute(script.format(0.0), tmp_path, cache).stderr == ""  # nothing is left to compile
+
+
+def test_one_process_can_compile_every_system() -> None:
+    """Where there are fewer processors than systems, a process compiles several."""
+    one_processor = "import os; os.cpu_count = os.process_cpu_count = lambda: 1"
+    command = [sys.executable, "-c", f"{one_processor}; from body_tracking import compilation; compilation.run(None)"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.count("compiled: ") == sum(bool(system.prepare) for system in SYSTEMS)
