@@ -105,7 +105,10 @@ def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
             wanted.append(colour)
     for topic in wanted:
         if topic not in topics:
-            raise graph.GraphError(f"no topic {topic}")
+            hint = (
+                " (it comes compressed: --compressed)" if any(each.startswith(f"{topic}/") for each in topics) else ""
+            )
+            raise graph.GraphError(f"no topic {topic}{hint}")
     return tuple(wanted)
 
 

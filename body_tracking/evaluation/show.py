@@ -27,7 +27,7 @@ def summary(angles: AngleSeries, truth: AngleSeries | None = None) -> Table:
         *_range("", known),
         Column("final", "final", "deg", np.degrees(final)),
         Column("stddev", "stddev", "deg", np.degrees(np.median(angles.stddev, axis=0))),
-        Column("known", "known", "%", 1e2 * np.isfinite(known).mean(axis=0)),
+        Column("known", "finite", "%", 1e2 * np.isfinite(known).mean(axis=0)),
     ]
     error = wrapped(known - true)
     if np.isfinite(error).any():
@@ -43,7 +43,7 @@ def summary(angles: AngleSeries, truth: AngleSeries | None = None) -> Table:
     if are_fine(angles):
         columns = [each._replace(digits=3) if each.unit == "deg" else each for each in columns]
     note = "stddev: median" + (", inf if unknown in most frames" if np.isinf(columns[3].values).any() else "")
-    note += ". known: share of the frames with a finite angle, however large its stddev."
+    note += ". finite: share of the frames with an angle, however large its stddev (evaluate: known below 30 deg)."
     if np.isfinite(error).any():
         note += "\nFrom true min on: of frames with a truth. in 2 sd: errors within two stddev; 95 % is ideal."
     return Table("angles", "angle", angles.names, tuple(columns), note)

@@ -140,6 +140,12 @@ def run(args: argparse.Namespace) -> int:
             f"clock {clock.offset:+.4f} s (+-{quality.clock_stddev:.4f}), "
             f"drift {clock.drift_ppm:+.0f} ppm, residual {1e3 * quality.residual:.0f} mm"
         )
+        if not quality.rotation_stddev < parameters.max_rotation_stddev:
+            limit = np.degrees(parameters.max_rotation_stddev)
+            print(
+                f"warning: {name}: the yaw is uncertain (good is below {limit:.1f} deg); record more motion, or other "
+                "poses, with all of the person in view of both sensors"
+            )
     if args.output is not None:
         print(f"saved to {args.output}")
     return 0

@@ -335,7 +335,8 @@ class Supervisor:
         if self.failure:
             self.console.line(f"body_tracking: {self.failure}", error=True)
             return
-        self.console.line(monitor.summary(self.options, time.monotonic() - begin, self._restarts()))
+        elapsed = time.monotonic() - begin
+        self.console.line(monitor.summary(self.options, elapsed, self._restarts(), interrupted=self.interrupted))
         self.console.line(f"logs: {self.folder}")
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:

@@ -96,7 +96,7 @@ def test_errors_pass_over_the_cut_at_180_degrees() -> None:
 
 def test_the_note_explains_the_columns_that_are_there() -> None:
     angles = series([10.0, 20.0], [1.0, 40.0])
-    assert "known:" in summary(angles).note and "in 2 sd:" not in summary(angles).note
+    assert "finite:" in summary(angles).note and "in 2 sd:" not in summary(angles).note
     assert "in 2 sd:" in summary(angles, series([11.0, 20.0], [0.0, 0.0])).note
 
 
