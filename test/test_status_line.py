@@ -33,5 +33,5 @@ def test_problems_are_named_by_their_nodes() -> None:
     assert monitor.summary(options, 3.0, {}) == f"{end} (imu_skeleton: forearm_left: not aligned)"
     monitor.angles = 7
     assert monitor.summary(options, 3.0, {}) == "played arm in 3.0 s with start and end: 7 frames of joint angles"
-    stopped = monitor.summary(options, 3.0, {}, interrupted=True)
-    assert stopped == "stopped arm after 3.0 s with the start: 7 frames of joint angles"
+    stopped = monitor.summary(options, 3.0, {}, played=False)
+    assert stopped == "stopped before the end of arm, after 3.0 s with the start: 7 frames of joint angles"

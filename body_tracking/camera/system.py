@@ -105,10 +105,8 @@ def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
             wanted.append(colour)
     for topic in wanted:
         if topic not in topics:
-            hint = (
-                " (it comes compressed: --compressed)" if any(each.startswith(f"{topic}/") for each in topics) else ""
-            )
-            raise graph.GraphError(f"no topic {topic}{hint}")
+            compressed = any(each.startswith(f"{topic}/compressed") for each in topics)
+            raise graph.GraphError(f"no topic {topic}{' (it comes compressed: --compressed)' if compressed else ''}")
     return tuple(wanted)
 
 

@@ -10,7 +10,6 @@ import hashlib
 import os
 import shutil
 import sys
-import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -38,29 +37,18 @@ QUIET = 2.0
 """Seconds of compiling after which the user reads why the program waits."""
 
 
-class CompilingNotice(event.Listener):
+class CompilingNotice(event.TimingListener):
     """Prints one line to stderr where a process compiles for long; loading from the cache prints nothing."""
 
-    def __init__(self) -> None:
-        """Nothing has been compiled yet."""
-        self._seconds = 0.0
-        self._starts: list[float] = []
-
-    def on_start(self, event: Any) -> None:
-        """A loop is about to be compiled, perhaps for another one that is being compiled."""
-        self._starts.append(time.monotonic())
-
     def on_end(self, event: Any) -> None:
-        """A loop has been compiled."""
-        took = time.monotonic() - self._starts.pop()
-        if self._starts:
-            return  # its time is part of the outer loop's
-        if self._seconds <= QUIET < self._seconds + took:
+        """A loop has been compiled; ``duration`` grows where it is not part of another one."""
+        before = self.duration if self.done else 0.0
+        super().on_end(event)  # type: ignore[no-untyped-call]
+        if self.done and before <= QUIET < self.duration:
             print("compiling loops, once for each version: this may take a minute", file=sys.stderr, flush=True)
-        self._seconds += took
 
 
-NOTICE = CompilingNotice()
+NOTICE = CompilingNotice()  # type: ignore[no-untyped-call]
 event.register("numba:compile", NOTICE)  # type: ignore[no-untyped-call]
 
 

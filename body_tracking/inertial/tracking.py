@@ -130,10 +130,9 @@ class InertialTracker:
         self._model = UpperBody()
         unknown = [name for name in segments if name not in self._model.segment_names]
         if unknown or not segments or len(set(segments)) < len(segments):
-            problem = "none, or one twice"
-            if unknown:
-                problem = f"unknown: {', '.join(unknown)}; expected some of {', '.join(self._model.segment_names)}"
-            raise InertialTrackingError(f"segments with inertial sensors: {problem}")
+            problem = f"unknown: {', '.join(unknown)}" if unknown else "none, or one twice"
+            expected = ", ".join(self._model.segment_names)
+            raise InertialTrackingError(f"segments with inertial sensors: {problem}; expected some of {expected}")
         self.segments = tuple(segments)
         self._intended = intended_mountings(self.segments, mountings)
         self._world = world

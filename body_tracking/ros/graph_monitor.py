@@ -201,16 +201,14 @@ class GraphMonitor:
         known = [float(value) for value in values if value is not None]
         return f"delay {sum(known):.1f} ms" if len(known) == len(chain) else ""
 
-    def summary(
-        self, options: Options, elapsed: float, restarts: Mapping[str, int], *, interrupted: bool = False
-    ) -> str:
-        """The last line of a run, which a user may have interrupted."""
+    def summary(self, options: Options, elapsed: float, restarts: Mapping[str, int], *, played: bool = True) -> str:
+        """The last line of a run; ``played`` says whether a bag came to its end."""
         seconds = f"{elapsed:.1f} s"
         what = f"ran for {seconds}"
-        if options["bag"] and interrupted:
-            what = f"stopped {options['bag']} after {seconds} with the start"
-        elif options["bag"]:
+        if options["bag"] and played:
             what = f"played {options['bag']} in {seconds} with start and end"
+        elif options["bag"]:
+            what = f"stopped before the end of {options['bag']}, after {seconds} with the start"
         text = f"{what}: {self.angles} frames of joint angles"
         problems = () if self.angles else problem_parts(self._statuses)
         text += f" ({'; '.join(problems)})" if problems else ""

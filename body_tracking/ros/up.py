@@ -336,7 +336,8 @@ class Supervisor:
             self.console.line(f"body_tracking: {self.failure}", error=True)
             return
         elapsed = time.monotonic() - begin
-        self.console.line(monitor.summary(self.options, elapsed, self._restarts(), interrupted=self.interrupted))
+        played = any(child.done for child in self.children)
+        self.console.line(monitor.summary(self.options, elapsed, self._restarts(), played=played))
         self.console.line(f"logs: {self.folder}")
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:

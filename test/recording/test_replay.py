@@ -357,6 +357,10 @@ def test_calibrate_prints_poses_and_clocks(wave: Path, tmp_path: Path, command: 
         assert sensor["clock_offset_s"] == pytest.approx(offset_s, abs=0.06)
         assert sensor["residual_mm"] < 100.0
     assert "kinect2: at (" in command("calibrate", wave, "--method", "thesis")[1]
+    strict = tmp_path / "strict.yaml"
+    strict.write_text("calibration:\n  ros__parameters:\n    max_rotation_stddev: 0.001\n")
+    assert "warning" not in command("calibrate", BAG)[1]
+    assert "warning: kinect2: the yaw is uncertain" in command("calibrate", BAG, "--params-file", strict)[1]
     # A saved calibration can be used from the first frame on.
     brief = beginning(BAG, tmp_path / "brief", 2.0)
     code, out, error = command(
