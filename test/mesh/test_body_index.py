@@ -32,6 +32,7 @@ from body_tracking.pipeline.stage import Now
 from body_tracking.recording.replay import ReplaySettings, replay
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, BagReader, BagWriter
 from body_tracking.systems import options_of, played
+from draws import some
 
 ARMS = [getattr(Joint, f"{name}_{side}") for side in ("LEFT", "RIGHT") for name in ("SHOULDER", "ELBOW", "WRIST")]
 STAMPS = [*recording().images]
@@ -215,7 +216,7 @@ WALKS = {
 }
 
 
-@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize("walk", some(list(WALKS)))
 def test_the_person_is_kept_while_somebody_else(walk: str) -> None:
     """Errors of the arms' joints with body-index images and without; without, two who touch are one surface."""
     nodes = {True: calibrated(), False: calibrated()}

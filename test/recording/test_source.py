@@ -62,7 +62,7 @@ def test_every_frame_comes_in_order_and_then_the_end() -> None:
 
 
 def test_frames_are_due_when_they_were_received_then() -> None:
-    start = time.time() + 3.0
+    start = time.time() + 1.5
     sources = [
         RecordingSource(SourceSettings(name, file=str(BAG), start_time=start)) for name in ("kinect1", "kinect2")
     ]
