@@ -12,12 +12,15 @@ three shipped recordings, which are simulated. Figures over these recordings are
   et al., Eur. Spine J. 20 Suppl. 5 (2011) 572, 709 people); a forward bend is at first twice as large in the lumbar
   spine as in the hips, and less later (Esola et al., Spine 21 (1996) 71), so that both get the same deviation
 - the others: a share of the range to one side in :mod:`body_tracking.kinematics.ranges`, whose sources stand there; a
-  third for lateral bending* and the neck, half for axial rotation and the clavicle (chosen on 16 simulated and five
-  real people, ``docs/accuracy.md``: a quarter drew raised arms down)
+  third for lateral bending*, the neck and the wrist, half for axial rotations and the clavicle (chosen on 16 simulated
+  and five real people, ``docs/accuracy.md``: a quarter drew raised arms down). Forearms turn by 50 deg either way in
+  daily activities (Morrey et al., J. Bone Joint Surg. Am. 63 (1981) 872)
+- elbows: uniform over their range, since no flexion is more usual than another
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,8 +42,15 @@ STDDEV: dict[str, float] = {
     "neck_lateral": 15.0,
     "clavicle_protraction": 16.0,
     "clavicle_elevation": 16.0,
+    "shoulder_z": 55.0,
+    "forearm_pronation": 45.0,
+    "wrist_flexion": 26.0,
+    "wrist_deviation": 12.0,
 }
 """Degrees about zero."""
+
+UNIFORM = ("elbow_flexion",)
+"""Coordinates of which every value in the range is as usual."""
 
 TILT_STDDEV = (10.0, 6.0)
 """Degrees: tilt of the pelvis against gravity, forward and sideways."""
@@ -65,7 +75,8 @@ class Tilt:
 class PosturePrior:
     """Mean and standard deviation of each coordinate of ``upper_body`` after the base.
 
-    Coordinates that are not in :data:`STDDEV` have the centre of their range of motion, and a sixth of its width.
+    Coordinates that are not in :data:`STDDEV` have the centre of their range of motion, and a sixth of its width; those
+    of :data:`UNIFORM` have the deviation of a uniform distribution.
 
     Attributes:
         mean, stddev: (26,) radians, of ``SoftCoordinates``.
@@ -78,7 +89,9 @@ class PosturePrior:
         self.postural: BoolArray = np.array([name in STDDEV for name in names])
         postural = np.radians([STDDEV.get(name, 0.0) for name in names])
         self.mean: FloatArray = np.where(self.postural, 0.0, ranges.centre)
-        self.stddev: FloatArray = np.where(self.postural, postural, ranges.stddev)
+        uniform = np.array([name in UNIFORM for name in names])
+        flat = (ranges.high - ranges.low) / math.sqrt(12.0)
+        self.stddev: FloatArray = np.where(self.postural, postural, np.where(uniform, flat, ranges.stddev))
         self.tilt_stddev: FloatArray = np.radians(TILT_STDDEV)
 
     @staticmethod

@@ -25,7 +25,7 @@ from body_tracking.filters.ekf import sources as orientation
 from body_tracking.filters.ekf.filter import ExtendedKalmanFilter, prepare
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.sources import PER_SOURCE, Sources
-from body_tracking.kinematics.posture import STDDEV
+from body_tracking.kinematics.posture import STDDEV, PosturePrior
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UNOBSERVED
 from body_tracking.simulation.random_people import (
@@ -403,7 +403,7 @@ def test_ranges_bound_the_deviation_after_a_source_falls_silent() -> None:
     estimate = known(estimator)
     elbow = NAMES.index("elbow_flexion_right")
     deviation = np.sqrt(estimate.covariance[elbow, elbow])
-    assert np.radians(20.0) < deviation < 1.5 * Ranges(MODEL).stddev[elbow - 6]
+    assert np.radians(20.0) < deviation < 1.5 * PosturePrior(MODEL, Ranges(MODEL)).stddev[elbow - 6]
 
 
 @pytest.mark.parametrize("turn", some([(0.0, 0.0, 0.35), (0.35, 0.0, 0.0)]))
