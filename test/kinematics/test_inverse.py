@@ -125,6 +125,35 @@ def test_missing_points_keep_what_is_seen_right(missing: tuple[Joint, ...], unkn
             assert_allclose(stddev[column], INVERSE.prior.stddev[column - 6], rtol=0.01)
 
 
+@pytest.mark.parametrize("degrees", [5.0, 30.0, 110.0, 140.0])
+def test_an_elbow_is_fitted_where_its_points_are_however_far_it_bends(degrees: float) -> None:
+    """It was fitted at 21 instead of 5 degrees, while points of 40 mm have a deviation of 13."""
+    q, elbow = MODEL.neutral(), NAMES.index("elbow_flexion_left")
+    tangent = np.zeros(MODEL.nv)
+    tangent[elbow] = np.radians(degrees)
+    q = MODEL.integrate(q, tangent)
+    lengths = MODEL.default_lengths()
+    fit = INVERSE.solve(MODEL.forward(q, lengths).positions, np.full(len(MODEL.joints), 0.04), lengths)
+    off = MODEL.difference(q, fit.q)[elbow]
+    assert abs(off) < 0.5 * np.sqrt(fit.covariance[elbow, elbow])
+
+
+@pytest.mark.parametrize("degrees", [-80.0, 0.0, 80.0])
+def test_the_rotation_of_a_forearm_that_nothing_shows_is_stated_to_be_anywhere_in_its_range(degrees: float) -> None:
+    """Its prior of 30 degrees counted as known, and 80 lay beyond its band."""
+    q, column = MODEL.neutral(), NAMES.index("forearm_pronation_left")
+    tangent = np.zeros(MODEL.nv)
+    tangent[column] = np.radians(degrees)
+    q = MODEL.integrate(q, tangent)
+    lengths = MODEL.default_lengths()
+    unseen = of(Joint.HAND_LEFT, Joint.HAND_TIP_LEFT, Joint.THUMB_LEFT)
+    points = np.where(unseen[:, None], np.nan, MODEL.forward(q, lengths).positions)
+    fit = INVERSE.solve(points, np.full(len(MODEL.joints), 0.02), lengths)
+    stddev = np.sqrt(fit.covariance[column, column])
+    assert abs(MODEL.difference(q, fit.q)[column]) < 1.96 * stddev
+    assert stddev > np.radians(40.0)
+
+
 def test_the_covariance_is_that_of_many_noisy_fits() -> None:
     """Of the fitted points, which the noise affects; the ranges of motion determine the rest."""
     rng = np.random.default_rng(5)

@@ -29,6 +29,8 @@ from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.filters.smoothing import MAX_LAG
 from body_tracking.kinect.simulated import KinectErrors
 from body_tracking.kinematics.conventions import convention
+from body_tracking.kinematics.posture import PosturePrior
+from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.base import to_nanoseconds
 from body_tracking.messages.calibration import time_reference_to_clock, transform_to_pose
@@ -190,6 +192,20 @@ def test_the_extended_filter_publishes_its_whole_state(extended_wave: Path, repl
     # Two sensors out of step, with an output for each frame at its own time: more than the reference has, and in order.
     stamps = np.array([each.stamp_ns for each in frames])
     assert (np.diff(stamps) > 0).all()
+
+
+def test_nothing_is_stated_to_be_vaguer_than_the_prior_of_a_pose(extended_wave: Path) -> None:
+    """Forearms were stated with up to 63 degrees and wrists with 20, since only the trunk and clavicles had priors."""
+    model = UpperBody()
+    prior = PosturePrior(model, Ranges(model))
+    vaguest = dict(zip(model.coordinate_names[6:], prior.stddev.tolist(), strict=True))
+    with BagReader(extended_wave) as bag:
+        states = [deserialize(JOINT_STATE, raw.cdr) for raw in bag.messages([f"{ANGLES}_stddev"])]
+    stated = np.median([state.position for state in states], axis=0)
+    for name, stddev in zip(states[0].name, stated.tolist(), strict=True):
+        coordinate = name.removesuffix("_body1")
+        if coordinate.startswith(("forearm", "wrist", "clavicle", "neck")):
+            assert stddev < vaguest[coordinate], coordinate
 
 
 def test_the_covariance_of_the_model_is_written_where_asked_for_and_nothing_else_changes(
