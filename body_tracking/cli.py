@@ -8,12 +8,27 @@ import os
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from body_tracking.core.errors import BodyTrackingError
 
 if TYPE_CHECKING:
     from body_tracking.pipeline.system import Command
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line that names the command's help, instead of its whole usage."""
+
+    def error(self, message: str) -> NoReturn:
+        """Exit with code 2."""
+        self.exit(2, f"body_tracking: {message}; see {self.prog} --help\n")
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """As the base class; exits for an unknown argument, which argparse would leave to the outermost parser."""
+        found, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return found, unknown
 
 
 def subcommands() -> dict[str, Command]:
@@ -26,7 +41,7 @@ def subcommands() -> dict[str, Command]:
 
 def parser(command: str | None = None) -> argparse.ArgumentParser:
     """The parser of one subcommand; for an unknown or no command, one with the names of all."""
-    top = argparse.ArgumentParser(
+    top = Parser(
         prog="body_tracking",
         description="Joint angles with standard deviations from several sensors: the live graph, "
         "and the same chain offline over recordings.",

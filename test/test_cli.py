@@ -91,6 +91,27 @@ def test_missing_files_are_reported_in_one_line(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("words", "said", "command"),
+    [
+        ("replay bag -o out --filtre ekf", "unrecognized arguments: --filtre ekf", "body_tracking replay"),
+        ("up --rate fast", "argument --rate: invalid float value: 'fast'", "body_tracking up"),
+        ("replay bag", "the following arguments are required: -o/--output", "body_tracking replay"),
+        ("camera show image.png -o out.png --large", "unrecognized arguments: --large", "body_tracking camera show"),
+        ("replya bag", "argument COMMAND: invalid choice: 'replya'", "body_tracking"),
+    ],
+)
+def test_a_wrong_argument_is_one_line_that_names_the_help_of_its_command(
+    words: str, said: str, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(words.split())
+    assert ended.value.code == 2
+    captured = capsys.readouterr()
+    assert captured.err.startswith(f"body_tracking: {said}") and captured.err.endswith(f"; see {command} --help\n")
+    assert captured.err.count("\n") == 1 and not captured.out
+
+
 def test_closed_stdout_is_no_error() -> None:
     command = [sys.executable, "-m", "body_tracking.cli", "bag", "info", "--json", str(ROOT / "bags" / "tpose_wave")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
