@@ -122,6 +122,17 @@ def test_closed_stdout_is_no_error() -> None:
         assert process.stderr.read() == b""
 
 
+def test_python_runs_the_package_as_the_command() -> None:
+    found = [
+        subprocess.run(
+            [sys.executable, "-m", module, "bag", "info", "nowhere"], capture_output=True, text=True, timeout=60
+        )
+        for module in ("body_tracking", "body_tracking.cli")
+    ]
+    assert found[0].returncode == found[1].returncode == 2
+    assert found[0].stderr == found[1].stderr != ""
+
+
 @pytest.mark.parametrize("command", ["call", "doctor"])
 def test_help_loads_neither_numpy_nor_the_client_library(command: str) -> None:
     code = f"""
