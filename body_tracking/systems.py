@@ -205,7 +205,8 @@ def nodes_for(options: Options) -> tuple[NodeSpec, ...]:
     """
     specs = [spec for system in SYSTEMS for spec in system.specs(options)]
     if not any(NODES[spec.executable].place < Place.CONSUMER and not is_player(spec) for spec in specs):
-        raise graph.GraphError("no sensors: name some that give skeletons, images, markers or inertial readings")
+        flags = (f"--{option.name.replace('_', '-')}" for option in OPTIONS.values() if option.source)
+        raise graph.GraphError(f"no sensors: name some with {', '.join(('--sensors', '--imus', *flags))}")
     specs.sort(key=lambda spec: -NODES[spec.executable].place)
     viewed = asked(options, **{view.option: view.option for view in VIEWS})
     return tuple(

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Final
 
 import body_tracking
-from body_tracking.core.message_types import COMPRESSED_IMAGE, IMAGE, IMU
+from body_tracking.core.message_types import COMPRESSED_IMAGE, IMAGE, IMU, POINT_CLOUD
 from body_tracking.core.parameters import Value
+from body_tracking.markers import setup
 
 SETUPS: Final[Mapping[str, Mapping[str, Value]]] = {
     "cameras_turning": {"camera_rig": "config/camera_rig", "compressed": "colour"},
@@ -18,15 +20,39 @@ SETUPS: Final[Mapping[str, Mapping[str, Value]]] = {
 }
 """Options of ``up`` for those shipped recordings whose topics do not determine them."""
 
-_CAMERAS = "--camera, --camera-rig, --depth or --marker-setup"
-TAKEN_BY: Final[Mapping[str, str]] = {IMAGE: _CAMERAS, COMPRESSED_IMAGE: _CAMERAS, IMU: "--imus"}
-"""The options of ``up`` and ``replay``, by the types of topics whose names do not say which system takes them."""
+_CAMERAS: Final = ("--camera", "--camera-rig", "--depth", "--marker-setup")
+_BY_TYPE: Final[Mapping[str, tuple[str, ...]]] = {
+    IMAGE: _CAMERAS,
+    COMPRESSED_IMAGE: _CAMERAS,
+    IMU: ("--imus",),
+}
 
 
-def options_for_types(types: Iterable[str]) -> str:
-    """What to give for a recording of these types without skeletons; empty if nothing takes them."""
-    options = sorted({TAKEN_BY[each] for each in types if each in TAKEN_BY})
-    return f"give up or replay the option that takes them: {', '.join(options)}" if options else ""
+def options_for_topic(name: str, type_name: str) -> tuple[str, ...]:
+    """The options of ``up`` and ``replay`` that take a topic that is no skeleton; none if nothing takes it."""
+    if type_name == POINT_CLOUD and name.endswith((setup.POINTS, "/balls")):
+        return ("--marker-setup",)
+    return _BY_TYPE.get(type_name, ())
+
+
+def advice_for(topics: Mapping[str, str]) -> str:
+    """What to give for a recording of these topics without skeletons; empty if nothing takes them.
+
+    Args:
+        topics: type by name.
+    """
+    found = {name: options_for_topic(name, type_name) for name, type_name in topics.items()}
+    options = sorted(set(chain.from_iterable(found.values())))
+    if not options:
+        return ""
+    page = " (docs/markers.md says how to make a setup)" if ("--marker-setup",) in found.values() else ""
+    return f"give up or replay the option that takes them: {listed(options, 'or')}{page}"
+
+
+def listed(names: Sequence[str], last: str = "and") -> str:
+    """``a, b and c``."""
+    *others, final = names
+    return f"{', '.join(others)} {last} {final}" if others else final
 
 
 def is_bag(path: Path) -> bool:

@@ -30,7 +30,7 @@ from body_tracking.pipeline.offline import OfflineRunner
 from body_tracking.pipeline.people import SubjectSelector
 from body_tracking.pipeline.system import Options
 from body_tracking.recording import forked
-from body_tracking.recording.finding import options_for_types
+from body_tracking.recording.finding import advice_for
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader
@@ -212,7 +212,7 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
     """
     began = time.perf_counter()
     with RigReader(bag_path) as bag:
-        advice = options_for_types(each.type_name for each in bag.topics.values())
+        advice = advice_for({name: each.type_name for name, each in bag.topics.items()})
         topics = {} if _without(settings, bag) else sensor_topics(bag, settings.sensors, advice)
         settings = replace(settings, sensors=tuple(topics.values()))
         truth = [topic for topic in bag.topics if topic.startswith("/ground_truth/")]

@@ -115,7 +115,7 @@ def clock() -> Finding:
 def bag(path: Path) -> Iterator[Finding]:
     """Findings on a folder or a single mcap file."""
     # these need libraries whose absence the doctor has to name
-    from body_tracking.recording.finding import TAKEN_BY, options_for_types
+    from body_tracking.recording.finding import advice_for, options_for_topic
     from body_tracking.recording.info import bag_info
     from body_tracking.recording.rosbag2 import UnsupportedBagError
 
@@ -134,10 +134,12 @@ def bag(path: Path) -> Iterator[Finding]:
     namespace = names.rig_namespace(topic.name for topic in info.topics)
     clouds = (topic.name for topic in info.topics if topic.type == POINT_CLOUD and topic.count)
     sensors = graph.sensors_among(names.within(name, namespace) or name for name in clouds)
-    others = {topic.name: topic.type for topic in info.topics if topic.type in TAKEN_BY and topic.count}
+    others = {
+        topic.name: topic.type for topic in info.topics if topic.count and options_for_topic(topic.name, topic.type)
+    }
     if not sensors and others:
         found = f"no skeletons on /<sensor>/skeleton, but {', '.join(others)}"
-        yield Finding(WARNING, f"{path}: {found}", options_for_types(others.values()))
+        yield Finding(WARNING, f"{path}: {found}", advice_for(others))
     elif not sensors:
         found = f"no skeletons on /<sensor>/skeleton; topics: {', '.join(topic.name for topic in info.topics)}"
         yield Finding(PROBLEM, f"{path}: {found}", "record the sensors' topics; docs/recordings.md has other formats")

@@ -35,7 +35,7 @@ from body_tracking.node_parameters import parameters_for
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.shared import names_in
 from body_tracking.pipeline.system import NodeSpec, Options
-from body_tracking.recording.finding import options_for_types
+from body_tracking.recording.finding import advice_for
 from body_tracking.recording.rig import RigReader
 from body_tracking.robot.system import convention_of
 from body_tracking.ros import dds
@@ -150,7 +150,7 @@ def options_for(args: argparse.Namespace, found: Mapping[str, Value] = MappingPr
         except graph.GraphError as error:
             raise UpError(f"{args.bag}: {error}") from error
         if not options["played"]:
-            advice = options_for_types(types.values())
+            advice = advice_for(types)
             what = f"no topic /<sensor>/skeleton; it has {', '.join(sorted(topics)) or 'none'}"
             raise UpError(f"{args.bag}: {what}{f'; {advice}' if advice else ''}")
     return options

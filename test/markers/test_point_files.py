@@ -200,6 +200,21 @@ def test_files_are_imported_as_points(tmp_path: Path, capsys: pytest.CaptureFixt
         assert not (tmp_path / "other").exists()
 
 
+def test_points_without_a_setup_are_refused_with_the_option_and_the_page(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, bag, out = write_c3d(tmp_path / "a.c3d", moving(), ["a", "b", "c"]), tmp_path / "bag", tmp_path / "out"
+    assert cli.main(["import", str(path), "-o", str(bag)]) == 0
+    capsys.readouterr()
+    for words in (["replay", str(bag), "-o", str(out)], ["up", "--bag", str(bag)]):
+        assert cli.main(words) == 2
+        said = capsys.readouterr().err
+        assert "--marker-setup" in said and "docs/markers.md" in said and said.count("\n") == 1
+    assert cli.main(["replay", str(bag), "-o", str(out), "--sensors", "none"]) == 2
+    assert "--marker-setup" in capsys.readouterr().err
+    assert not out.exists()
+
+
 def test_a_real_recording_is_imported_whole(shared_data: Path, tmp_path: Path) -> None:
     path = shared_data / "marker_unlabelled" / "racing_full.c3d"
     if not path.exists():
