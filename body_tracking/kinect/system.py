@@ -52,12 +52,8 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
 
 
 def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
-    wanted = tuple(map(graph.skeleton_topic, _own(options)))
-    missing = [topic for topic in wanted if topic not in topics]
-    if missing:
-        there = ", ".join(graph.sensors_among(topics)) or "none"
-        raise graph.GraphError(f"no topic {missing[0]}; its sensors are {there}")
-    return wanted
+    graph.check_skeletons(_own(options), topics)
+    return tuple(map(graph.skeleton_topic, _own(options)))
 
 
 _AZURE = "/body_tracking_data"

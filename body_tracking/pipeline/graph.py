@@ -133,6 +133,16 @@ def imu_topics(entries: Iterable[str]) -> tuple[ImuTopics, ...]:
     return tuple(found)
 
 
+def _imus_among(topics: Iterable[str]) -> list[str]:
+    """The inertial sensors among these topics, as entries of :func:`imu_topics`; SEGMENT for one that no name tells."""
+    from body_tracking.core.body_model import SEGMENTS  # imports numpy, which --help does without
+
+    found = (re.fullmatch(r"/(\w+)/imu/data(_raw)?", topic) for topic in topics)
+    names = sorted({match[1] for match in found if match})
+    segments = (next((each for each in SEGMENTS if f"_{name}".endswith(f"_{each}")), "SEGMENT") for name in names)
+    return [name if name == segment else f"{segment}:{name}" for name, segment in zip(names, segments, strict=True)]
+
+
 def played_imu_topics(entries: Iterable[str], there: Collection[str]) -> tuple[str, ...]:
     """The topics of inertial sensors that a bag has.
 
@@ -147,7 +157,9 @@ def played_imu_topics(entries: Iterable[str], there: Collection[str]) -> tuple[s
     for each in imu_topics(entries):
         own = [topic for topic in each.imu if topic in there]
         if not own:
-            raise GraphError(f"the bag has no topic {' nor '.join(each.imu)} of the inertial sensor on {each.segment}")
+            worn = _imus_among(there)
+            names = f"its inertial sensors are {', '.join(worn)}" if worn else "it has no topic /<segment>/imu/data"
+            raise GraphError(f"no topic {' or '.join(each.imu)} for {each.segment}; {names}")
         found += [*own, *([each.mag] if each.mag in there else [])]
     return tuple(found)
 
@@ -257,6 +269,19 @@ def sensors_among(topics: Iterable[str]) -> tuple[str, ...]:
             except BodyTrackingError:
                 continue  # fused, filtered, ground_truth
     return tuple(sorted(found))
+
+
+def check_skeletons(wanted: Iterable[str], topics: Collection[str]) -> None:
+    """Refuse a sensor without skeletons among a recording's topics.
+
+    Raises:
+        GraphError: a wanted sensor is missing; names those that are there.
+    """
+    for sensor in wanted:
+        if skeleton_topic(sensor) not in topics:
+            there = sensors_among(topics)
+            names = f"its sensors are {', '.join(there)}" if there else "it has no sensor with skeletons"
+            raise GraphError(f"no topic {skeleton_topic(sensor)}; {names}")
 
 
 # --- inputs and conventions

@@ -157,11 +157,15 @@ def sensor_topics(bag: BagReader, wanted: Sequence[str] = (), advice: str = "") 
     """
     there = graph.sensors_among(bag.topics)
     names = tuple(wanted) or there
-    missing = [name for name in names if name not in there]
-    if missing or not names:
-        what = f"no topic {graph.skeleton_topic(missing[0])}" if missing else "no topic /<sensor>/skeleton"
-        hint = f"; {advice}" if advice and not there else ""
-        raise ReplayError(f"{bag.path}: {what}; it holds {', '.join(sorted(bag.topics)) or 'no topics'}{hint}")
+    hint = f"; {advice}" if advice and not there else ""
+    if not names:
+        raise ReplayError(
+            f"{bag.path}: no topic /<sensor>/skeleton; it holds {', '.join(sorted(bag.topics)) or 'no topics'}{hint}"
+        )
+    try:
+        graph.check_skeletons(names, bag.topics)
+    except graph.GraphError as error:
+        raise ReplayError(f"{bag.path}: {error}{hint}") from error
     for name in names:
         kind = bag.topics[graph.skeleton_topic(name)].type_name
         if kind != POINT_CLOUD:

@@ -334,6 +334,25 @@ def test_a_recording_without_skeletons_is_refused_with_the_options_for_it(tmp_pa
     assert code == 2 and "no topic /<sensor>/skeleton" in error and "--camera" not in error
 
 
+def test_a_sensor_that_a_recording_lacks_is_refused_with_those_that_it_has(tmp_path: Path, command: Command) -> None:
+    """Not with all its topics; an inertial sensor in the form of the option ``--imus``."""
+    five, out = BAG.with_name("five_systems"), ("-o", tmp_path / "out")
+    worn = "forearm_left, forearm_right, pelvis, upper_arm_left, upper_arm_right, upper_trunk"
+    for words, said in (
+        (("replay", five, *out, "--sensors", "kinect1,kinect9"), "kinect9/skeleton; its sensors are kinect1, kinect2"),
+        (("calibrate", five, "--sensors", "kinect9"), "/kinect9/skeleton; its sensors are kinect1, kinect2"),
+        (("replay", five, *out, "--imus", "hand_left"), f"for hand_left; its inertial sensors are {worn}"),
+        (("replay", BAG, *out, "--imus", "hand_left"), "for hand_left; it has no topic /<segment>/imu/data"),
+        (("up", "--bag", BAG, "--imus", "hand_left"), "for hand_left; it has no topic /<segment>/imu/data"),
+    ):
+        code, _, error = command(*words)
+        assert code == 2 and error.count("\n") == 1
+        assert error.endswith(f"{said}\n")
+    driver = ("/imu_forearm_left/imu/data_raw", "/imu7/imu/data", "/imu7/imu/data_raw")
+    with pytest.raises(graph.GraphError, match="are SEGMENT:imu7, forearm_left:imu_forearm_left"):
+        graph.played_imu_topics(["hand_left"], driver)
+
+
 def test_the_summary_of_a_replay_has_poses_and_known_angles(replayed_wave: Path, extended_wave: Path) -> None:
     lines = list(summary(replayed_wave))
     assert lines[0].startswith("kinect1: at x 0.00, y 0.00, z 0.00 m of world, looks 0 deg")
