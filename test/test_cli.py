@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import pytest
 
 from body_tracking import cli
+from body_tracking.recording.rosbag2 import BagWriter
 from body_tracking.ros import advice
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -110,6 +111,42 @@ def test_a_wrong_argument_is_one_line_that_names_the_help_of_its_command(
     captured = capsys.readouterr()
     assert captured.err.startswith(f"body_tracking: {said}") and captured.err.endswith(f"; see {command} --help\n")
     assert captured.err.count("\n") == 1 and not captured.out
+
+
+TAKEN = (
+    ("calibrate nowhere -o taken.yaml", "taken.yaml"),
+    ("evaluate nowhere --save-mountings taken.yaml", "taken.yaml"),
+    ("import nowhere.csv -o taken", "taken"),
+    ("markers angles nowhere --setup nowhere -o taken", "taken"),
+    ("markers render -o taken --setup setup", "taken"),
+    ("markers render -o new --setup setup", "setup/rig.yaml"),
+    ("mesh personalise nowhere -o taken.yaml", "taken.yaml"),
+    ("replay nowhere -o taken", "taken"),
+    ("simulate -o taken", "taken"),
+    ("simulate baseline arm -o .", "trial1"),
+)
+"""Commands that write data, and an output that exists already."""
+
+
+@pytest.mark.parametrize(("words", "output"), TAKEN, ids=[words.partition(" -")[0] for words, _ in TAKEN])
+def test_data_are_replaced_only_where_the_command_says_so(
+    words: str, output: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / output
+    path.parent.mkdir(exist_ok=True)
+    if path.suffix:
+        path.write_text("mine", encoding="utf-8")
+    else:
+        BagWriter(path).close()
+    before = {each: each.read_bytes() for each in tmp_path.rglob("*") if each.is_file()}
+    assert cli.main(words.split()) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and said.endswith(f"{output}: exists already; --overwrite replaces it\n")
+    assert {each: each.read_bytes() for each in tmp_path.rglob("*") if each.is_file()} == before
+    with pytest.raises(SystemExit):
+        cli.main([*words.partition(" -")[0].split(), "--help"])
+    assert "--overwrite" in capsys.readouterr().out
 
 
 def test_closed_stdout_is_no_error() -> None:

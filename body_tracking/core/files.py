@@ -35,6 +35,10 @@ class FileError(BodyTrackingError):
     """A file cannot be read, or has another format; the text does not name the file."""
 
 
+class OutputError(BodyTrackingError):
+    """A file that a command is to write exists already."""
+
+
 class FileLimitError(FileError):
     """A file exceeds a limit: of size, nesting, aliases or digits."""
 
@@ -95,6 +99,18 @@ def write_text(path: Path, text: str) -> None:
         partial.replace(path)
     except OSError as error:
         raise FileError(f"cannot be written ({error.strerror})") from error
+
+
+def check_new(path: Path, *, overwrite: bool) -> None:
+    """Refuse a command's output that exists already, before its content is computed.
+
+    Raises:
+        OutputError: the file exists and ``overwrite`` is false, or it is a folder.
+    """
+    if path.is_dir():
+        raise OutputError(f"{path}: is a folder")
+    if path.exists() and not overwrite:
+        raise OutputError(f"{path}: exists already; --overwrite replaces it")
 
 
 def dump_yaml(content: Any, **layout: Any) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+from body_tracking.core.files import check_new
 from body_tracking.evaluation import reference_report
 from body_tracking.evaluation.comparison import Evaluation, evaluate
 from body_tracking.evaluation.estimated_segments import read_segments
@@ -95,6 +96,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--save-mountings", type=Path, metavar="FILE", help="likewise: write the mountings of the targets that fit EST"
     )
+    parser.add_argument("--overwrite", action="store_true", help="with --save-mountings: replace an existing FILE")
     parser.add_argument("--html", type=Path, metavar="FILE", help="write a page with tables and pictures")
     parser.add_argument("--json", action="store_true", help="print all results as JSON")
     parser.add_argument("-v", "--verbose", action="store_true", help="also print tables with all joints and angles")
@@ -144,6 +146,8 @@ def _judge_by_markers(args: argparse.Namespace) -> ReferenceEvaluation:
 
 
 def run(args: argparse.Namespace) -> int:
+    if args.save_mountings is not None:
+        check_new(args.save_mountings, overwrite=args.overwrite)
     if _by_markers(args):
         judged = _judge_by_markers(args)
         report = reference_report.report_of(judged)

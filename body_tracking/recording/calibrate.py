@@ -14,6 +14,7 @@ import numpy as np
 from body_tracking.calibration.online import CalibrationParameters, OnlineCalibration
 from body_tracking.calibration.rigid import CalibrationError
 from body_tracking.calibration.storage import save, to_dict
+from body_tracking.core.files import check_new
 from body_tracking.core.parameters import fields_of
 from body_tracking.core.sensor_poses import CalibrationResult
 from body_tracking.node_parameters import parameters_for
@@ -105,11 +106,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--params-file", type=Path, metavar="F", help="ROS parameters file, as for the calibration node"
     )
     command.add_argument("-o", "--output", type=Path, metavar="FILE", help="save the calibration (YAML)")
+    command.add_argument("--overwrite", action="store_true", help="replace an existing FILE")
     command.add_argument("--json", action="store_true", help="print the result as JSON")
     command.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
+    if args.output is not None:
+        check_new(args.output, overwrite=args.overwrite)
     options = options_of()
     spec = next(spec for spec in nodes_for(options) if spec.name == "calibration")
     values = parameters_for([spec], args.params_file, absent=all_nodes_for(options))["calibration"]

@@ -53,7 +53,7 @@ from body_tracking.messages.skeletons import skeletons_to_cloud
 from body_tracking.pipeline.graph import DEFAULT_BODY, TRUE_ANGLES
 from body_tracking.recording.image_folder import COLOUR_FOLDERS, import_folder, is_image_folder
 from body_tracking.recording.progress import Progress
-from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter
+from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter, check_new_bag
 
 CSV_SUFFIXES = (".csv", ".csv.gz")
 NTU_SUFFIX = ".skeleton"
@@ -402,6 +402,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """``body_tracking import``."""
+    check_new_bag(args.output, overwrite=args.overwrite)
     if any(map(is_image_folder, args.files)):
         if len(args.files) > 1:
             raise ImportFileError(f"{args.files[0]}: a folder of images is imported alone")

@@ -44,7 +44,7 @@ from body_tracking.pipeline.system import load
 from body_tracking.recording import marker_wand
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rig import RigReader
-from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, BagWriter
+from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, BagWriter, check_new_bag
 
 _VIEWS = 600
 """Approximate number of views of a labelled target: more views hardly add information."""
@@ -299,6 +299,7 @@ def fit(args: argparse.Namespace) -> int:
 
 def angles(args: argparse.Namespace) -> int:
     """``markers angles``."""
+    check_new_bag(args.output, overwrite=args.overwrite)
     stages = (DetectorStage, TriangulationStage, TrackerStage, AnglesOfTargetsStage)
     with RigReader(args.bag) as bag:
         needed = _after(sources_of(bag, args.setup), stages)

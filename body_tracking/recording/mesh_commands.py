@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from body_tracking.core.camera import Camera
 from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.files import check_new
 from body_tracking.core.parameters import check_all
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.mesh.codecs import DepthImage, DepthInfo, MeshMarker
@@ -133,6 +134,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     shape = actions.add_parser("personalise", help="write the shape of a recorded person, for up --person")
     shape.add_argument("bag", type=Path, help="recording with depth images")
     shape.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="YAML file to write")
+    shape.add_argument("--overwrite", action="store_true", help="replace an existing FILE")
     shape.set_defaults(run=_personalise)
     show = actions.add_parser("show", help="draw the mesh over depth images")
     show.add_argument("bag", type=Path, help="recording with depth images and the mesh")
@@ -144,6 +146,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def _personalise(args: argparse.Namespace) -> int:
+    check_new(args.output, overwrite=args.overwrite)
     print(personalise(args.bag, args.depth, args.output))
     print(f"written to {args.output}")
     return 0

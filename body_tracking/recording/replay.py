@@ -33,7 +33,7 @@ from body_tracking.recording import forked
 from body_tracking.recording.finding import advice_for
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rig import RigReader
-from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader
+from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, check_new_bag
 from body_tracking.recording.summary import summary
 from body_tracking.systems import (
     OPTIONS,
@@ -370,8 +370,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
-    if args.output.is_dir() and not args.overwrite:
-        raise ReplayError(f"{args.output}: exists already; --overwrite replaces it")
+    check_new_bag(args.output, overwrite=args.overwrite)
     report = replay(args.bag, args.output, settings_from(args), overwrite=args.overwrite)
     if args.json:
         print(json.dumps({"bag": str(args.bag), "output": str(args.output), **asdict(report)}, indent=2))

@@ -380,6 +380,22 @@ class _Sink:
         """Required by the mcap writer."""
 
 
+def check_new_bag(folder: Path, *, overwrite: bool) -> None:
+    """Refuse the folder of a bag to be written, if it cannot be made or must not be replaced.
+
+    Raises:
+        BagError: it exists and ``overwrite`` is false, or it is no bag.
+    """
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise BagError(f"{folder}: exists and is no folder")
+    if not _files(folder) and not (folder / METADATA).exists():
+        raise BagError(f"{folder}: exists and is no bag")
+    if not overwrite:
+        raise BagError(f"{folder}: exists already; --overwrite replaces it")
+
+
 class BagWriter:
     """Writes a bag.
 
@@ -530,16 +546,11 @@ class BagWriter:
 
     def _prepare(self, overwrite: bool, resume: bool) -> int:
         """Prepare the folder; returns the number of the file to write."""
-        if self.folder.exists() and not self.folder.is_dir():
-            raise BagError(f"{self.folder}: exists and is no folder")
-        if not self.folder.exists() or (resume and not any(self.folder.iterdir())):
+        if not self.folder.exists() or (resume and self.folder.is_dir() and not any(self.folder.iterdir())):
             self.folder.mkdir(parents=True, exist_ok=True)
             return 0
-        if not (overwrite or resume):
-            raise BagError(f"{self.folder}: exists already")
+        check_new_bag(self.folder, overwrite=overwrite or resume)
         parts = _files(self.folder)
-        if not parts and not (self.folder / METADATA).exists():
-            raise BagError(f"{self.folder}: exists and is no bag")
         for path in parts:
             _refuse_if_in_use(path)
         if resume and not overwrite:

@@ -30,7 +30,7 @@ from body_tracking.messages.imus import imu_to_message, magnetic_field_to_messag
 from body_tracking.messages.model import estimate_to_joint_state
 from body_tracking.pipeline import graph
 from body_tracking.recording.progress import Progress
-from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter, serialize
+from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter, check_new_bag, serialize
 from body_tracking.simulation import camera_bags, depth_bags, five_systems, marker_bags
 from body_tracking.simulation.layouts import Layout, around, layout
 from body_tracking.simulation.people import MODEL
@@ -256,6 +256,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """``body_tracking simulate``."""
+    check_new_bag(args.output, overwrite=args.overwrite)
     setup = Setup(
         "walking_and_turning" if args.crossing else args.motion,
         _layout_of(args),

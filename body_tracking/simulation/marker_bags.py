@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from body_tracking.core import so3
+from body_tracking.core.files import check_new
 from body_tracking.core.message_types import IMAGE, JOINT_STATE
 from body_tracking.core.qos import LATCHED, RELIABLE
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
@@ -33,7 +34,7 @@ from body_tracking.messages.cameras import CAMERA_INFO
 from body_tracking.pipeline import graph
 from body_tracking.recording.marker_commands import fit_recording
 from body_tracking.recording.progress import Progress
-from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, BagWriter
+from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, BagWriter, check_new_bag
 from body_tracking.simulation.marker_scene import DIAMETER, JOINTS, MarkerScene, marker_scene, stereo_rig
 from body_tracking.simulation.repertoire import MOTIONS
 
@@ -267,11 +268,15 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the person and the noise")
     parser.add_argument("--boards", type=int, default=0, metavar="N", help="also N views of a chessboard, in FOLDER")
     parser.add_argument("--wand", type=int, default=0, metavar="N", help="also N places of a wand, as FOLDER/wand")
-    parser.add_argument("--overwrite", action="store_true", help="replace an existing OUT")
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing OUT and setup")
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
+    for bag in (args.output, *([args.setup / "wand"] if args.wand else [])):
+        check_new_bag(bag, overwrite=args.overwrite)
+    for name in (setup.RIG, setup.TARGETS):
+        check_new(args.setup / name, overwrite=args.overwrite)
     scene = marker_scene(args.motion, args.seed, args.rate, args.seconds)
     args.setup.mkdir(parents=True, exist_ok=True)
     save_rig(scene.rig, args.setup / setup.RIG)

@@ -391,6 +391,11 @@ def test_calibrate_prints_poses_and_clocks(wave: Path, tmp_path: Path, command: 
         assert sensor["relative_yaw_deg"] == pytest.approx(yaw_deg, abs=6.0)
         assert sensor["clock_offset_s"] == pytest.approx(offset_s, abs=0.06)
         assert sensor["residual_mm"] < 100.0
+    _, _, error = command("calibrate", BAG, "-o", tmp_path / "robust.yaml")
+    assert "robust.yaml: exists already; --overwrite replaces it" in error
+    code, out, error = command("calibrate", BAG, "-o", tmp_path / "thesis.yaml", "--overwrite")
+    assert code == 0, error
+    assert (tmp_path / "thesis.yaml").read_text() == (tmp_path / "robust.yaml").read_text()
     assert "kinect2: at (" in command("calibrate", wave, "--method", "thesis")[1]
     strict = tmp_path / "strict.yaml"
     strict.write_text("calibration:\n  ros__parameters:\n    max_rotation_stddev: 0.001\n")
