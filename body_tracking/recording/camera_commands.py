@@ -14,13 +14,14 @@ from body_tracking.camera import model_files
 from body_tracking.camera.pictures import draw
 from body_tracking.camera.pose_model import Landmarks, PoseModel
 from body_tracking.core.errors import BodyTrackingError
+from body_tracking.recording.picture import write_picture
 
 _ROUNDS: Final = 3
 """Number of searches in a single image, each in the region of the previous result, as in a video."""
 
 
 class CameraCommandError(BodyTrackingError):
-    """Raised when an image cannot be read or written."""
+    """Raised when an image cannot be read."""
 
 
 def people_in(image: NDArray[np.uint8], model: PoseModel, people: int) -> list[Landmarks]:
@@ -71,7 +72,6 @@ def _show(args: argparse.Namespace) -> int:
     found = people_in(image, model, max(args.people, 1))
     for each in found:
         draw(image, each)
-    if not cv2.imwrite(str(args.output), image[..., ::-1]):
-        raise CameraCommandError(f"{args.output}: cannot be written")
+    write_picture(args.output, image)
     print(f"people: {len(found)}\npicture: {args.output}")
     return 0

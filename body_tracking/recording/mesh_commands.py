@@ -22,6 +22,7 @@ from body_tracking.mesh.stage import MeshStage
 from body_tracking.mesh.topics import body_index_topic, depth_topic, info_topic, mesh_topic
 from body_tracking.messages.cdr import stamp_of
 from body_tracking.pipeline.offline import OfflineRunner
+from body_tracking.recording.picture import write_picture
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BAG_WIRE
@@ -154,7 +155,6 @@ def _personalise(args: argparse.Namespace) -> int:
 
 def _show(args: argparse.Namespace) -> int:
     row = np.concatenate(pictures(args.bag, args.depth, max(args.images, 1)), axis=1)
-    if not cv2.imwrite(str(args.output), row[..., ::-1]):
-        raise MeshCommandError(f"{args.output}: cannot be written")
+    write_picture(args.output, row)
     print(f"picture: {args.output}")
     return 0

@@ -21,6 +21,7 @@ from body_tracking.mesh.storage import load
 from body_tracking.mesh.topics import IMAGES, depth_topic, info_topic, mesh_topic
 from body_tracking.messages.cameras import CAMERA_INFO
 from body_tracking.messages.markers import MARKER
+from body_tracking.recording.picture import PictureError, write_picture
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagWriter
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -56,7 +57,7 @@ def test_show_draws_images_that_have_a_mesh(tmp_path: Path, capsys: pytest.Captu
             bag.write(depth_topic("kinect1"), DepthImage().encode((stamp, "camera", depth), BAG_WIRE), stamp)
         for stamp in (10, 12, 14):
             bag.write(mesh_topic("kinect1"), MeshMarker().encode((stamp, "camera", corners), BAG_WIRE), stamp)
-    out = tmp_path / "mesh.png"
+    out = tmp_path / "pictures" / "mesh.png"
     assert cli.main(["mesh", "show", str(folder), "-o", str(out), "--images", "2"]) == 0
     picture = cv2.imread(str(out)).astype(int)
     assert picture.shape == (720, 720, 3)
@@ -65,6 +66,22 @@ def test_show_draws_images_that_have_a_mesh(tmp_path: Path, capsys: pytest.Captu
     capsys.readouterr()
     assert cli.main(["mesh", "show", str(folder), "-o", str(out), "--depth", "kinect2"]) != 0
     assert "/kinect2/depth/camera_info" in capsys.readouterr().err
+
+
+def test_a_picture_is_written_into_a_new_folder_or_refused_in_a_line(tmp_path: Path) -> None:
+    image = np.zeros((4, 6, 3), np.uint8)
+    image[..., 0] = 200
+    for _ in range(2):  # a picture may be replaced
+        write_picture(tmp_path / "new" / "folder" / "red.png", image)
+    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "new" / "folder" / "red.png"))[..., ::-1], image)
+    for name, said in (
+        ("red", r"no format of pictures ends with nothing; call it \.png"),
+        ("red.xyz", r"no format of pictures ends with \.xyz"),
+        ("file/red.png", "cannot be written"),
+    ):
+        (tmp_path / "file").write_text("")
+        with pytest.raises(PictureError, match=said):
+            write_picture(tmp_path / name, image)
 
 
 def test_a_recording_without_depth_images_or_with_too_few_poses_says_so(
