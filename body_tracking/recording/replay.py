@@ -18,22 +18,24 @@ from typing import Any, Final
 from body_tracking.calibration.storage import load
 from body_tracking.core.clocks import jumped_back
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.core.message_types import POINT_CLOUD
+from body_tracking.core.message_types import DIAGNOSTICS, POINT_CLOUD
 from body_tracking.core.parameters import Value, check_all
 from body_tracking.core.skeleton import NANOSECONDS, Skeleton
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.filters.smoothing import WHOLE_LAG
 from body_tracking.messages.codecs import Skeletons
+from body_tracking.messages.diagnostics import statuses
 from body_tracking.node_parameters import parameters_for
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.offline import OfflineRunner
 from body_tracking.pipeline.people import SubjectSelector
+from body_tracking.pipeline.roles import ROLES
 from body_tracking.pipeline.system import Options
 from body_tracking.recording import forked
 from body_tracking.recording.finding import advice_for
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rig import RigReader
-from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, check_new_bag
+from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, check_new_bag, deserialize
 from body_tracking.recording.summary import summary
 from body_tracking.systems import (
     OPTIONS,
@@ -128,6 +130,8 @@ class ReplayReport:
 
     Attributes:
         frames: number of joint angle messages.
+        filter_name: the filter that made the angles; empty if none runs, as in a graph of markers alone.
+        recorded_filters: the filters of the graph that was recorded, by its diagnostics; its angles are not read.
         recording_s: length of the recording by its log times.
         elapsed_s: computing time.
         counters: of events and unusable messages.
@@ -135,6 +139,8 @@ class ReplayReport:
     """
 
     frames: int
+    filter_name: str
+    recorded_filters: tuple[str, ...]
     recording_s: float
     elapsed_s: float
     counters: Mapping[str, int]
@@ -241,7 +247,11 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
             runner = OfflineRunner(stages, BAG_WIRE, downstream.take)
             progress = Progress(bag.start_ns, bag.end_ns)
             started = False
-            for raw in bag.messages(kept):
+            recorded_filters: dict[str, None] = {}
+            for raw in bag.messages((*kept, graph.DIAGNOSTICS_TOPIC)):
+                if raw.topic == graph.DIAGNOSTICS_TOPIC:
+                    recorded_filters.update(dict.fromkeys(_filters_in(raw.cdr)))
+                    continue
                 if not started and raw.topic in (topics or sources):
                     started = True
                     runner.start(raw.log_time_ns)
@@ -265,6 +275,8 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
             raise ReplayError(f"{bag_path}: no frame of {given} came through ({said})")
         return ReplayReport(
             written.frames,
+            str(values["skeleton_filter"]["filter"]) if "skeleton_filter" in values else "",
+            tuple(recorded_filters),
             (bag.end_ns - bag.start_ns) / NANOSECONDS,
             time.perf_counter() - began,
             {name: count for name, count in sorted(counters.items()) if count},
@@ -285,6 +297,15 @@ def _without(settings: ReplaySettings, bag: BagReader) -> bool:
     if settings.sensors or not settings.other_sources:
         return False
     return bool(settings.options()["computed"]) or not graph.sensors_among(bag.topics)
+
+
+def _filters_in(diagnostics: bytes) -> list[str]:
+    """The filters whose nodes report in a message of ``/diagnostics``; none if it is malformed."""
+    try:
+        found = statuses(deserialize(DIAGNOSTICS, diagnostics))
+    except BodyTrackingError:
+        return []
+    return [each.text for each in found if each.node.rpartition("/")[2] == "skeleton_filter" and each.text in ROLES]
 
 
 def _listed(counters: Mapping[str, int]) -> str:
@@ -382,6 +403,9 @@ def run(args: argparse.Namespace) -> int:
         f"{report.frames} frames of joint angles from {report.recording_s:.1f} s of recording in "
         f"{report.elapsed_s:.1f} s ({speed:.{0 if speed >= 10.0 else 1}f} times real time)"
     )
+    if report.filter_name:
+        others = f"; the recorded angles (filter {', '.join(report.recorded_filters)}) are not read"
+        print(f"filter: {report.filter_name}{others if report.recorded_filters else ''}")
     for line in summary(args.output):
         print(line)
     if args.verbose:

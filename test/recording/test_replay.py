@@ -22,7 +22,7 @@ import pytest
 
 from body_tracking import cli
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.core.message_types import JOINT_STATE, POINT_CLOUD, TIME_REFERENCE, TRANSFORM
+from body_tracking.core.message_types import DIAGNOSTICS, JOINT_STATE, POINT_CLOUD, TIME_REFERENCE, TRANSFORM
 from body_tracking.core.parameters import ParameterError
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, TrackingState
 from body_tracking.filters import DEFAULT_FILTER
@@ -34,6 +34,7 @@ from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.base import to_nanoseconds
 from body_tracking.messages.calibration import time_reference_to_clock, transform_to_pose
+from body_tracking.messages.diagnostics import diagnostics
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.offline import OfflineRunner
@@ -42,7 +43,7 @@ from body_tracking.recording.forked import Downstream, ForkedDownstream
 from body_tracking.recording.importer import import_files
 from body_tracking.recording.replay import ReplayError, ReplaySettings, replay
 from body_tracking.recording.rig import RigReader
-from body_tracking.recording.rosbag2 import BagError, BagReader, BagWriter, RawMessage, deserialize
+from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagError, BagReader, BagWriter, RawMessage, deserialize
 from body_tracking.recording.summary import summary
 from body_tracking.simulation.bags import write_bag
 from body_tracking.simulation.scene import Setup, simulate
@@ -367,6 +368,28 @@ def test_the_summary_of_a_replay_has_poses_and_known_angles(replayed_wave: Path,
     )
     # an angle with the prior's deviation counts as unknown
     assert any("; not left" in line for line in summary(extended_wave))
+
+
+def test_a_replay_names_its_filter_and_that_of_the_recorded_graph(tmp_path: Path, command: Command) -> None:
+    """Of a recording of a live graph, whose diagnostics say which filter made the angles in it."""
+    brief = beginning(BAG, tmp_path / "brief", 2.0)
+    with BagReader(brief) as bag, BagWriter(tmp_path / "live") as writer:
+        for topic, info in bag.topics.items():
+            writer.add_topic(topic, info.type_name)
+        for raw in bag.messages():
+            writer.write(raw.topic, raw.cdr, raw.log_time_ns)
+        writer.add_topic(graph.DIAGNOSTICS_TOPIC, DIAGNOSTICS)
+        for name, text in (("skeleton_filter: state", "ekf"), ("fusion: state", "lkf_zero_velocity")):
+            status = diagnostics(bag.start_ns, name, "", 0, text, {}, BAG_MESSAGES)
+            writer.write_message(graph.DIAGNOSTICS_TOPIC, status, bag.start_ns)
+        writer.write(graph.DIAGNOSTICS_TOPIC, b"no diagnostics", bag.end_ns)
+    code, plain, error = command("replay", brief, "-o", tmp_path / "plain")
+    assert code == 0, error
+    assert f"\nfilter: {DEFAULT_FILTER}\n" in plain
+    code, live, error = command("replay", tmp_path / "live", "-o", tmp_path / "out")
+    assert code == 0, error
+    assert f"\nfilter: {DEFAULT_FILTER}; the recorded angles (filter ekf) are not read\n" in live
+    assert contents(tmp_path / "out") == contents(tmp_path / "plain")
 
 
 def test_calibrate_prints_poses_and_clocks(wave: Path, tmp_path: Path, command: Command) -> None:
