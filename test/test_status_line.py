@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not installed")
 
 from body_tracking.messages.node_status import NodeStatus
+from body_tracking.pipeline.system import Options
 from body_tracking.ros.graph_monitor import GraphMonitor, calibration_part, problem_parts
+from body_tracking.systems import options_of
 
 
 def test_the_status_line_names_a_calibration_only_where_there_is_something_to_calibrate() -> None:
@@ -35,3 +39,20 @@ def test_problems_are_named_by_their_nodes() -> None:
     assert monitor.summary(options, 3.0, {}) == "played arm in 3.0 s with start and end: 7 frames of joint angles"
     stopped = monitor.summary(options, 3.0, {}, played=False)
     assert stopped == "stopped before the end of arm, after 3.0 s with the start: 7 frames of joint angles"
+
+
+def test_the_recorder_rightly_waits_for_a_bag_that_has_not_begun() -> None:
+    monitor = object.__new__(GraphMonitor)  # without a node
+    monitor._angles_topics, monitor._namespace, monitor.angles, monitor.clock_ns = (), "/", 0, 0
+    alone, with_bag = options_of(sensors=()), options_of(sensors=(), bag="arm")
+
+    def line(options: Options, level: int, text: str) -> str:
+        monitor._statuses = {"bag_recorder": NodeStatus("bag_recorder: state", level, text, received=time.monotonic())}
+        return monitor.line(options, 1.0, {})
+
+    waiting = "waiting for /clock (use_sim_time): nothing is recorded"
+    assert "bag_recorder" not in line(with_bag, 1, waiting)
+    assert f"bag_recorder: {waiting}" in line(alone, 1, waiting)
+    assert "bag_recorder: disk full" in line(with_bag, 2, "disk full")
+    monitor.clock_ns = 1
+    assert "bag_recorder: 2 topics" in line(with_bag, 1, "2 topics are not recorded")

@@ -42,9 +42,16 @@ def calibration_part(status: NodeStatus | None, sensors: Collection[str]) -> lis
     return [f"calibration: {status.text if status is not None else 'none'}"]
 
 
-def problem_parts(statuses: Mapping[str, NodeStatus]) -> list[str]:
-    """The problems that nodes report, with their names; not those of nodes that have a part of their own."""
+def problem_parts(statuses: Mapping[str, NodeStatus], *, bag_starts: bool = False) -> list[str]:
+    """The problems that nodes report, with their names; not those of nodes that have a part of their own.
+
+    Args:
+        statuses: by node.
+        bag_starts: a bag is to be played and has not begun: the recorder rightly waits for its clock.
+    """
     bad = {name: each.text for name, each in statuses.items() if each.level and each.text and name not in _OWN_PART}
+    if bag_starts and "bag_recorder" in bad and statuses["bag_recorder"].level == 1:
+        del bad["bag_recorder"]
     return [f"{name}: {text}" for name, text in sorted(bad.items())]
 
 
@@ -158,7 +165,7 @@ class GraphMonitor:
             parts.append(delay)
         parts += calibration_part(fresh.get("calibration"), sensors_of(options))
         if not self.angles:
-            parts += problem_parts(fresh)
+            parts += problem_parts(fresh, bag_starts=bool(options["bag"]) and not self.clock_ns)
         malformed = sum(int(status.values.get("malformed", 0)) for status in fresh.values())
         if malformed:
             parts.append(f"malformed {malformed}")
