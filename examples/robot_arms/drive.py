@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -50,6 +51,7 @@ RESTART = 4.0
 """Seconds after which a killed player is started again."""
 PERIOD = 0.01
 """Seconds between two messages with the robot's state."""
+NUMBER = re.compile(r"\d+(\.\d+)?")
 COMPARED_DELAYS = np.arange(0.0, 0.3, 0.01)
 """Assumed delays of the joints behind the commands, seconds; the best one separates delay from other errors."""
 
@@ -103,13 +105,14 @@ class Arm(Node):
         self.go_to(np.array(message.data), 0.0)
 
     def on_diagnostics(self, message: DiagnosticArray) -> None:
-        """Note the player's position, and print why there are commands or none."""
+        """Note the player's position, and print why there are commands or none, unless only numbers have changed."""
         for status in statuses(message):
             if status.node == "bag_player":
                 self.played = status.number("position s") or 0.0
-            if status.node == "robot_commands" and status.text != self.reason:
-                self.reason = status.text
-                print(f"robot_commands: {self.reason}")
+            if status.node == "robot_commands":
+                before, self.reason = self.reason, status.text
+                if NUMBER.sub("", before) != NUMBER.sub("", self.reason):
+                    print(f"robot_commands: {self.reason}")
 
     def go_to(self, position: FloatArray, seconds: float) -> None:
         """Follow a command."""
@@ -222,6 +225,8 @@ class Graph:
     @staticmethod
     def _node(executable: str, **parameters: object) -> subprocess.Popen[bytes]:
         words = [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
+        # what robot_commands logs of its states is in its diagnostics, too, which the arm prints
+        words += ["--log-level", "warn"]
         return subprocess.Popen([sys.executable, "-m", "body_tracking.nodes", executable, "--ros-args", *words])
 
     def _play(self) -> None:

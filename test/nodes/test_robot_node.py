@@ -338,6 +338,9 @@ def test_the_example_follows_prints_and_draws(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert "robot_commands: approaching: everything was good for 0.5" in done.stdout
+    assert "robot_commands]" not in done.stderr  # the node's log, which has the same
+    states = [re.sub(r"[\d.]+", "", line) for line in done.stdout.splitlines() if line.startswith("robot_commands: ")]
+    assert all(one != next_one for one, next_one in itertools.pairwise(states))
     assert picture.read_bytes().startswith(b"\x89PNG")
     rows = {line.split()[0]: line.split() for line in done.stdout.splitlines() if line.startswith("joint_a")}
     assert len(rows) == 7
