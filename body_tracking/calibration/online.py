@@ -456,7 +456,9 @@ class OnlineCalibration:
                 return
             rotation, translation, residual = min(found, key=lambda each: each[2])
             pose = "T-pose" if is_t_pose(own[1]) else "still pose"
-            self.events.append(f"{name}: calibrated from a {pose}, residual {1e3 * residual:.0f} mm")
+            self.events.append(
+                f"{name}: calibrated from a {pose}, with a mean residual of {1e3 * residual:.0f} mm in it"
+            )
             other.started = rotation, translation
             if other.rotation is None or self.parameters.method == "thesis":
                 other.quality = SensorQuality(residual=residual, frames=FRAMES)

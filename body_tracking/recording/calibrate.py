@@ -135,6 +135,8 @@ def run(args: argparse.Namespace) -> int:
     for name, pose in result.poses.items():
         clock, quality = result.clocks[name], result.quality[name]
         x, y, z = pose.translation
+        # without an estimate from movement, which has a deviation, it is that of the still pose
+        of_what = "median" if np.isfinite(quality.rotation_stddev) else "mean"
         if name == result.reference:
             print(f"{name}: reference, at ({x:.3f}, {y:.3f}, {z:.3f}) m in world")
             continue
@@ -142,7 +144,7 @@ def run(args: argparse.Namespace) -> int:
             f"{name}: at ({x:.3f}, {y:.3f}, {z:.3f}) m in world, yaw {np.degrees(relative_yaw(result, name)):.2f} deg "
             f"(+-{np.degrees(quality.rotation_stddev):.2f}), "
             f"clock {clock.offset:+.4f} s (+-{quality.clock_stddev:.4f}), "
-            f"drift {clock.drift_ppm:+.0f} ppm, residual {1e3 * quality.residual:.0f} mm"
+            f"drift {clock.drift_ppm:+.0f} ppm, {of_what} residual {1e3 * quality.residual:.0f} mm"
         )
         if not quality.rotation_stddev < parameters.max_rotation_stddev:
             limit = np.degrees(parameters.max_rotation_stddev)

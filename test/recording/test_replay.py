@@ -419,7 +419,12 @@ def test_calibrate_prints_poses_and_clocks(wave: Path, tmp_path: Path, command: 
     code, out, error = command("calibrate", BAG, "-o", tmp_path / "thesis.yaml", "--overwrite")
     assert code == 0, error
     assert (tmp_path / "thesis.yaml").read_text() == (tmp_path / "robust.yaml").read_text()
-    assert "kinect2: at (" in command("calibrate", wave, "--method", "thesis")[1]
+    for method, kind in (("thesis", "mean"), ("robust", "median")):
+        said = command("calibrate", wave, "--method", method)[1]
+        assert re.search(
+            r"^kinect2: calibrated from a T-pose, with a mean residual of \d+ mm in it$", said, re.MULTILINE
+        )
+        assert re.search(rf"^kinect2: at \(.*, {kind} residual \d+ mm$", said, re.MULTILINE)
     strict = tmp_path / "strict.yaml"
     strict.write_text("calibration:\n  ros__parameters:\n    max_rotation_stddev: 0.001\n")
     assert "warning" not in command("calibrate", BAG)[1]
