@@ -1,4 +1,5 @@
-"""Draw the pictures of the pages that are computed: each angle of a convention, the T-pose, places of sensors.
+"""Draw the pictures of the pages that are computed: each angle of a convention, the T-pose, places of sensors, and the
+angles of the shipped recordings beside their truth.
 
     python docs/pictures.py
 
@@ -8,12 +9,14 @@ other angles of its convention stay, as far as they can (least squares). The tes
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
 import matplotlib
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -21,10 +24,12 @@ from matplotlib.axes import Axes
 
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.skeleton import Joint, Skeleton
+from body_tracking.evaluation.show import summarise
 from body_tracking.kinematics.conventions import angles_of
 from body_tracking.kinematics.positional import positional_angles
 from body_tracking.kinematics.tracking import angle_names
 from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.recording.replay import ReplaySettings, replay
 
 IMAGES = Path(__file__).resolve().parent / "images"
 Array = NDArray[np.float64]
@@ -209,13 +214,16 @@ def picture(convention: str) -> None:
 
 def save(figure: plt.Figure, name: str) -> None:
     """As a PNG file of 64 colours, which are enough for lines."""
-    from PIL import Image
-
     path = IMAGES / f"{name}.png"
     figure.savefig(path, dpi=100, facecolor="white")
     plt.close(figure)
+    reduce_colours(path, 64)
+
+
+def reduce_colours(path: Path, count: int) -> None:
+    """A picture of lines with fewer colours, in a quarter of the bytes."""
     with Image.open(path) as image:
-        image.convert("RGB").quantize(64, dither=Image.Dither.NONE).save(path, optimize=True)
+        image.convert("RGB").quantize(count, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def t_pose() -> None:
@@ -294,12 +302,24 @@ def places(name: str, least: float, greatest: float, what: str, side: bool) -> N
     save(figure, name)
 
 
+def shipped(bag: str) -> None:
+    """Every angle of a shipped recording beside its truth, as ``replay --filter ekf --convention isb`` and ``show``."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / bag
+        settings = ReplaySettings((), filter_name="ekf", convention="isb")
+        replay(IMAGES.parent.parent / "bags" / bag, out, settings)
+        summarise(out, IMAGES / f"{bag}.png")
+    reduce_colours(IMAGES / f"{bag}.png", 128)
+
+
 PICTURES: dict[str, Callable[[], None]] = {
     **{f"angles_{c}": lambda c=c: picture(c) for c in CONVENTIONS},  # type: ignore[misc]
     "t_pose": t_pose,
+    **{bag: lambda bag=bag: shipped(bag) for bag in ("tpose_wave", "tpose_slow_down", "tpose_torso_twist")},  # type: ignore[misc]
     "place_kinects": lambda: places("place_kinects", 30.0, 45.0, "kinect", side=True),
     "place_webcams": lambda: places("place_webcams", 30.0, 45.0, "camera", side=False),
 }
+
 
 if __name__ == "__main__":
     for make in PICTURES.values():
