@@ -204,7 +204,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--crossing", action="store_true", help="people walk past and hide each other; --motion has no effect"
     )
     command.add_argument(
-        "--imus", default="", metavar="SEGMENT,...", help="segments of the first person with an inertial sensor"
+        "--imus",
+        action="append",
+        default=[],
+        metavar="SEGMENT,...",
+        help="segments of the first person with an inertial sensor; repeatable",
     )
     command.add_argument("--raw", action="store_true", help="inertial sensors report no orientation")
     command.add_argument(
@@ -276,10 +280,11 @@ def run(args: argparse.Namespace) -> int:
 
 def _imus(args: argparse.Namespace) -> Iterator[SimulatedImu]:
     """The requested inertial sensors, each with its own clock."""
-    segments = [segment for segment in args.imus.split(",") if segment]
+    listed = ",".join(args.imus)
+    segments = [segment for segment in listed.split(",") if segment]
     twice = sorted({segment for segment in segments if segments.count(segment) > 1})
     if twice:
-        raise SceneError(f"--imus {args.imus}: {', '.join(twice)} comes twice")
+        raise SceneError(f"--imus {listed}: {', '.join(twice)} comes twice")
     for number, segment in enumerate(segments):
         yield SimulatedImu(
             f"imu_{segment}",

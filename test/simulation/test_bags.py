@@ -363,6 +363,7 @@ def test_the_shipped_parameters_file_holds_all_errors_at_their_defaults() -> Non
         (("--seed", "-1", "--imus", "pelvis"), "seed -1: must not be negative"),
         (("--imus", "nose"), "segment 'nose', expected one of pelvis, "),
         (("--imus", "pelvis,pelvis"), "--imus pelvis,pelvis: pelvis comes twice"),
+        (("--imus", "pelvis", "--imus", "pelvis"), "--imus pelvis,pelvis: pelvis comes twice"),
         (("--imus", "pelvis", "--imu-rate", "0"), "a rate of 0.0 Hz"),
         (("--config", "nowhere.yaml"), "body_tracking: nowhere.yaml: cannot be read"),
     ],
