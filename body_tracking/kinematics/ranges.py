@@ -1,8 +1,8 @@
 """Ranges of motion: soft limits of the angles of ``upper_body``, and the prior of an unobserved angle.
 
 The limits are soft, because people differ, and the frames of a sensor's skeleton are not those of a goniometer. The
-prior of an angle is normal about the centre of its range, with the limits at three standard deviations: people are
-seldom near their limits.
+prior of an angle is normal about the centre of its range, with the limits at three standard deviations, unless
+:mod:`body_tracking.kinematics.posture` has a better one: people are seldom near their limits.
 
 Sources: AAOS, "Joint motion: method of measuring and recording" (1965), as in Norkin and White, "Measurement of joint
 motion" (2016), appendix A, for neck, elbow, forearm and wrist; White and Panjabi, "Clinical biomechanics of the spine"
