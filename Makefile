@@ -100,7 +100,7 @@ failed=; phase() { name="$$1"; shift; echo "== $$name"; $(BIN)/python -m pytest 
 nice -n 19 $(MAKE) --no-print-directory lint >$(VENV)/lint.txt 2>&1 & lint=$$!; \
 nice -n 19 $(BIN)/python -m pytest -m "($(1)) and not processes" --numprocesses 2 --dist worksteal >$(VENV)/compute.txt 2>&1 & compute=$$!; \
 $(MAKE) --no-print-directory ros2-workspace || { failed=", the workspace of ros2"; export TEST_ROS2=failed; }; \
-phase "tests of time" -m "($(1)) and processes and alone" --numprocesses 2 --dist loadscope --no-loadscope-reorder; \
+phase "tests of time" -m "($(1)) and processes and alone"; \
 phase "tests of processes" -m "($(1)) and processes and not alone" --numprocesses 4 --dist loadscope --no-loadscope-reorder; \
 echo "== tests that compute"; wait $$compute || failed="$$failed, tests that compute"; cat $(VENV)/compute.txt; \
 echo "== formatting, lint, types"; wait $$lint || failed="$$failed, formatting, lint, types"; cat $(VENV)/lint.txt; \
