@@ -105,7 +105,7 @@ def _heading(points: FloatArray, pair: tuple[int, int]) -> FloatArray:
     return heading
 
 
-def _against_truth(
+def against_truth(
     angles: AngleSeries, truth: AngleSeries | None, names: Sequence[str]
 ) -> tuple[FloatArray, FloatArray]:
     """(n, k) errors of angles at stamps with a known truth, and (n, k) their stated standard deviations; radians."""
@@ -153,7 +153,7 @@ def of_posture(run: Run, name: str) -> dict[str, float]:
     figures: dict[str, float] = {}
     within: list[FloatArray] = []
     for label, names in FLEXIONS.items():
-        away, stddev = _against_truth(tracked.angles, tracked.true_angles, names)
+        away, stddev = against_truth(tracked.angles, tracked.true_angles, names)
         figures[label] = common.rms_deg(away)
         within.append(np.abs(away) <= 1.96 * stddev)
     figures["within"] = 100.0 * float(np.concatenate(within, axis=1).mean())
@@ -184,7 +184,7 @@ def of_shipped(bag: Path, name: str) -> dict[str, float]:
         tracked = read(Path(folder) / "out")
     assert tracked.true_angles is not None
     names = [each for each in tracked.angles.names if each in tracked.true_angles.names]
-    away, stddev = _against_truth(tracked.angles, tracked.true_angles, names)
+    away, stddev = against_truth(tracked.angles, tracked.true_angles, names)
     trunk = [each.startswith("trunk") for each in names]
     known = np.isfinite(stddev)
     return {

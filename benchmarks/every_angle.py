@@ -1,0 +1,103 @@
+"""How wrong is every angle of a convention? Both filters on simulated people before two Kinects v2 (layouts 2 and 4).
+
+Columns, in degrees: RMSE of the median person, median stated standard deviation, mean error; then the share of the
+errors within 1.96 of the deviation, and of the frames with a finite one. Left and right count together. The people,
+motions and seeds are those of the table in docs/accuracy.md; no filter was tuned on them.
+
+  python benchmarks/every_angle.py                        30 people: about 5 minutes on two cores
+  python benchmarks/every_angle.py --motions squat --convention model
+"""
+
+from __future__ import annotations
+
+import functools
+import sys
+import tempfile
+from pathlib import Path
+
+import common
+import numpy as np
+from ablation import against_truth
+from accuracy import Run
+
+from body_tracking.core.skeleton import FloatArray
+from body_tracking.evaluation.reading import read
+from body_tracking.filters import DEFAULT_FILTER
+from body_tracking.kinematics.conventions import CONVENTIONS
+from body_tracking.recording.replay import ReplaySettings, replay
+from body_tracking.simulation.bags import write_bag
+from body_tracking.simulation.repertoire import MOTIONS
+
+FILTERS = (DEFAULT_FILTER, "ekf")
+LAYOUTS = (2, 4)
+_FIRST_SEED = 9700
+
+Errors = dict[str, dict[str, tuple[FloatArray, FloatArray]]]
+"""By filter and angle without its side: (n,) errors and (n,) stated standard deviations, radians."""
+
+
+def errors_of(convention: str, run: Run) -> Errors:
+    """The errors of one person's angles."""
+    found: Errors = {}
+    with tempfile.TemporaryDirectory() as folder:
+        write_bag(run.recording(), Path(folder) / "in")
+        for name in FILTERS:
+            out = Path(folder) / name
+            replay(Path(folder) / "in", out, ReplaySettings((), filter_name=name, convention=convention))
+            tracked = read(out)
+            errors, stddevs = against_truth(tracked.angles, tracked.true_angles, tracked.angles.names)
+            kinds = np.array([_kind(each) for each in tracked.angles.names])
+            found[name] = {
+                kind: (errors[:, kinds == kind].ravel(), stddevs[:, kinds == kind].ravel())
+                for kind in dict.fromkeys(kinds)
+            }
+    return found
+
+
+def _kind(angle: str) -> str:
+    """The name without the side of an arm; ``thorax_axial_left`` is a direction."""
+    limb, _, side = angle.rpartition("_")
+    return limb if side in ("left", "right") and not angle.startswith(("thorax", "neck")) else angle
+
+
+def figures_of(people: list[tuple[FloatArray, FloatArray]]) -> dict[str, float]:
+    """The columns of one angle, from the errors and deviations of each person."""
+    errors, stddevs = (np.concatenate(each) for each in zip(*people, strict=True))
+    known = np.isfinite(errors) & np.isfinite(stddevs)
+    return {
+        "rmse": float(np.median([common.rms_deg(error) for error, _ in people])),
+        "stddev": float(np.degrees(np.median(stddevs[known]))),
+        "bias": float(np.degrees(errors[known].mean())),
+        "covered": float((np.abs(errors) <= common.NORMAL * stddevs)[known].mean()),
+        "finite": float(known.mean()),
+    }
+
+
+def main() -> int:
+    """The command line."""
+    parser = common.parser(__doc__, motions=list(MOTIONS), jobs=True)
+    parser.add_argument("--convention", choices=list(CONVENTIONS), default="isb", help="default: %(default)s")
+    args = parser.parse_args()
+    cases = [(motion, layout) for motion in args.motions for layout in LAYOUTS]
+    runs = [Run(motion, layout, _FIRST_SEED + number) for number, (motion, layout) in enumerate(cases)]
+    people = common.mapped(functools.partial(errors_of, args.convention), runs, args.jobs)
+    figures = {
+        name: {kind: figures_of([each[name][kind] for each in people]) for kind in people[0][name]} for name in FILTERS
+    }
+    met = {}
+    for name, rows in figures.items():
+        met[f"{name}: every angle finite in 99 %"] = min(row["finite"] for row in rows.values()) >= 0.99
+        low = {kind: row["covered"] for kind, row in rows.items() if row["covered"] < 0.9}
+        met[f"{name}: every angle covered in 90 %{'; not ' + ', '.join(low) if low else ''}"] = not low
+    default = figures[DEFAULT_FILTER]
+    worse = [kind for kind, row in figures["ekf"].items() if row["rmse"] > default[kind]["rmse"]]
+    met[f"ekf: no angle worse than with the default filter{'; not ' + ', '.join(worse) if worse else ''}"] = not worse
+    for rows in figures.values():
+        columns = next(iter(rows.values()))
+        rows["mean"] = {column: float(np.mean([row[column] for row in rows.values()])) for column in columns}
+    common.report(args, figures)
+    return common.verdicts(args, met)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
