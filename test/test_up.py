@@ -190,7 +190,7 @@ def test_no_process_remains(up: Callable[..., Up], tmp_path: Path, how: signal.S
     graph_up.process.send_signal(how)
     assert graph_up.until(lambda: graph_up.process.poll() is not None, timeout=120.0)
     assert graph_up.process.returncode == (0 if how is not signal.SIGKILL else -9)
-    # nodes that are still starting end as soon as they have, which a busy machine delays
+    # a node that is still starting ends once it has started, which takes longer on a busy machine
     _, alive = psutil.wait_procs(list(nodes), timeout=5.0 * contention())
     assert not alive
     if how is signal.SIGINT:

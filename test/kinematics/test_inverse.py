@@ -56,6 +56,13 @@ def with_bent_wrists(q: FloatArray, seed: int) -> FloatArray:
     return bent
 
 
+def upright(column: int, degrees: float) -> FloatArray:
+    """(35,) the neutral pose with one coordinate of the tangent changed."""
+    tangent = np.zeros(MODEL.nv)
+    tangent[column] = np.radians(degrees)
+    return MODEL.integrate(MODEL.neutral(), tangent)
+
+
 def distances(q: FloatArray, lengths: FloatArray, points: FloatArray) -> FloatArray:
     """(19,) metres between the points and those of a configuration."""
     return np.linalg.norm(MODEL.forward(q, lengths).positions - points, axis=1)
@@ -128,11 +135,8 @@ def test_missing_points_keep_what_is_seen_right(missing: tuple[Joint, ...], unkn
 @pytest.mark.parametrize("degrees", [5.0, 30.0, 110.0, 140.0])
 def test_an_elbow_is_fitted_where_its_points_are_however_far_it_bends(degrees: float) -> None:
     """It was fitted at 21 instead of 5 degrees, while points of 40 mm have a deviation of 13."""
-    q, elbow = MODEL.neutral(), NAMES.index("elbow_flexion_left")
-    tangent = np.zeros(MODEL.nv)
-    tangent[elbow] = np.radians(degrees)
-    q = MODEL.integrate(q, tangent)
-    lengths = MODEL.default_lengths()
+    elbow, lengths = NAMES.index("elbow_flexion_left"), MODEL.default_lengths()
+    q = upright(elbow, degrees)
     fit = INVERSE.solve(MODEL.forward(q, lengths).positions, np.full(len(MODEL.joints), 0.04), lengths)
     off = MODEL.difference(q, fit.q)[elbow]
     assert abs(off) < 0.5 * np.sqrt(fit.covariance[elbow, elbow])
@@ -141,11 +145,8 @@ def test_an_elbow_is_fitted_where_its_points_are_however_far_it_bends(degrees: f
 @pytest.mark.parametrize("degrees", [-80.0, 0.0, 80.0])
 def test_the_rotation_of_a_forearm_that_nothing_shows_is_stated_to_be_anywhere_in_its_range(degrees: float) -> None:
     """Its prior of 30 degrees counted as known, and 80 lay beyond its band."""
-    q, column = MODEL.neutral(), NAMES.index("forearm_pronation_left")
-    tangent = np.zeros(MODEL.nv)
-    tangent[column] = np.radians(degrees)
-    q = MODEL.integrate(q, tangent)
-    lengths = MODEL.default_lengths()
+    column, lengths = NAMES.index("forearm_pronation_left"), MODEL.default_lengths()
+    q = upright(column, degrees)
     unseen = of(Joint.HAND_LEFT, Joint.HAND_TIP_LEFT, Joint.THUMB_LEFT)
     points = np.where(unseen[:, None], np.nan, MODEL.forward(q, lengths).positions)
     fit = INVERSE.solve(points, np.full(len(MODEL.joints), 0.02), lengths)
