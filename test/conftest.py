@@ -35,12 +35,8 @@ PROCESSES = (
 
 ONE_AT_A_TIME = {
     "ros2": ("ros2/",),
-    "graphs": (
-        "works[README]",
-        "test_live_equals_offline.py",
-        "test_fifth_system.py",
-        "test_up.py",
-    ),
+    "up": ("test_up.py", "work[README]"),
+    "systems": ("test_live_equals_offline.py", "test_fifth_system.py"),
 }
 """Tests that start a dozen processes each, of which one of each kind runs at a time, before all others: several would
 starve each other while their nodes start."""

@@ -14,6 +14,7 @@ from types import TracebackType
 from typing import Any, Self
 
 import rclpy
+from bench_node import BenchNode
 from diagnostic_msgs.msg import DiagnosticArray
 from node_process import NodeProcess
 from rcl_interfaces.msg import Parameter, ParameterValue
@@ -103,7 +104,7 @@ class Running:
         self.diagnostics: dict[str, dict[str, str]] = {}
         self.context = rclpy.Context()
         rclpy.init(context=self.context, domain_id=int(self.environment["ROS_DOMAIN_ID"]))
-        self.node = rclpy.create_node("bench", context=self.context)
+        self.node = BenchNode("bench", context=self.context)
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, RELIABLE)

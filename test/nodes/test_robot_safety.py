@@ -14,6 +14,7 @@ import yaml
 
 rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 
+from bench_node import BenchNode  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from running import RELIABLE  # noqa: E402
 from sensor_msgs.msg import JointState, PointCloud2  # noqa: E402
@@ -163,7 +164,7 @@ class Bench:
             arguments += ["-p", f"{name}:mapping:={files[of]}", "-p", f"{name}:body:={of}"]
             arguments += ["-p", f"{name}:sensors:=[kinect1]"]
         rclpy.init(args=arguments, domain_id=domain())
-        self.node = rclpy.create_node("bench")
+        self.node = BenchNode("bench")
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.node)
         self.frames = self.node.create_publisher(PointCloud2, graph.skeleton_topic("kinect1"), 10)

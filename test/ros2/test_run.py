@@ -41,7 +41,7 @@ class AllNodes:
             "viewer": {"port": 0},
             **{name: {"setup": tools.share / "config" / "marker_setup"} for name in MARKER_NODES},
         }
-        parameters["marker_cameras"]["rate"] = 5.0  # rendered ones; 30 a second keep a processor busy
+        parameters["marker_cameras"]["rate"] = 1.0  # rendered ones; 30 a second keep a processor busy
         self.tools_of: dict[str, Tool] = {
             executable: tools.run(executable, **parameters.get(executable, {})) for executable in NODES
         }
