@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import pytest
 from tools import Tool, Tools
@@ -21,12 +21,14 @@ MARKER_NODES = (
 LACKING = ("robot_commands", "bag_player", "kinect_skeleton", "mesh_tracker", "camera_skeleton", "camera_rig")
 """Nodes that do nothing without a parameter."""
 NODES = startable(systems.EXECUTABLES)
+GROUPS = 4
+"""Groups of nodes that run at the same time: the time in which n nodes find each other grows with the square of n."""
 
 
-class AllNodes:
-    """All nodes in one domain, each in a process of its own."""
+class Nodes:
+    """A group of nodes in one domain, each in a process of its own."""
 
-    def __init__(self, tools: Tools) -> None:
+    def __init__(self, tools: Tools, names: Sequence[str]) -> None:
         self.tools = tools
         bag, mapping = tools.bag(), tools.share / "config" / "robots" / "iiwa7.yaml"
         parameters: dict[str, dict[str, object]] = {
@@ -43,7 +45,7 @@ class AllNodes:
         }
         parameters["marker_cameras"]["rate"] = 1.0  # rendered ones; 30 a second keep a processor busy
         self.tools_of: dict[str, Tool] = {
-            executable: tools.run(executable, **parameters.get(executable, {})) for executable in NODES
+            executable: tools.run(executable, **parameters.get(executable, {})) for executable in names
         }
 
     def text(self) -> str:
@@ -51,36 +53,38 @@ class AllNodes:
         return "\n".join(f"{name}: {tool.text()}" for name, tool in self.tools_of.items())
 
 
-@pytest.fixture(scope="module")
-def all_nodes(workspace: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Iterator[AllNodes]:
-    with Tools(workspace, tmp_path_factory.mktemp("all_nodes")) as tools:
-        yield AllNodes(tools)
+@pytest.fixture(scope="module", params=range(GROUPS))
+def nodes(
+    workspace: dict[str, str], tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
+) -> Iterator[Nodes]:
+    with Tools(workspace, tmp_path_factory.mktemp("nodes")) as tools:
+        yield Nodes(tools, NODES[request.param :: GROUPS])
 
 
-def test_every_node_publishes_diagnostics(all_nodes: AllNodes) -> None:
-    seen = all_nodes.tools.bench.diagnostics
-    wanted = set(NODES)
-    assert all_nodes.tools.bench.until(lambda: wanted <= seen.keys(), 60.0), (wanted - seen.keys(), all_nodes.text())
+def test_every_node_publishes_diagnostics(nodes: Nodes) -> None:
+    seen = nodes.tools.bench.diagnostics
+    wanted = nodes.tools_of.keys()
+    assert nodes.tools.bench.until(lambda: wanted <= seen.keys(), 60.0), (wanted - seen.keys(), nodes.text())
 
 
-def test_every_service_answers(all_nodes: AllNodes) -> None:
-    services = [each.name for each in systems.SERVICES if each.executable in systems.NODES]
+def test_every_service_answers(nodes: Nodes) -> None:
+    services = [each.name for each in systems.SERVICES if each.executable in nodes.tools_of]
     # The recorder is to start before it stops.
     first, later = [name for name in services if "start" in name], [name for name in services if "start" not in name]
-    for name in (*first, *some(later, 3)):
-        said = all_nodes.tools.ask("success=", "service", "call", f"/{name}", "std_srvs/srv/Trigger")
+    for name in (*first, *some(later)):
+        said = nodes.tools.ask("success=", "service", "call", f"/{name}", "std_srvs/srv/Trigger")
         answer = said.partition("response:")[2]
         assert "success=True" in answer or ("success=False" in answer and "message=''" not in answer), said
 
 
-def test_ctrl_c_ends_every_node_in_order(all_nodes: AllNodes) -> None:
-    assert [tool.process.poll() for tool in all_nodes.tools_of.values()] == [None] * len(NODES)
-    for tool in all_nodes.tools_of.values():
+def test_ctrl_c_ends_every_node_in_order(nodes: Nodes) -> None:
+    assert all(tool.process.poll() is None for tool in nodes.tools_of.values()), nodes.text()
+    for tool in nodes.tools_of.values():
         tool.interrupt()
-    codes = {name: tool.ended() for name, tool in all_nodes.tools_of.items()}
-    wrong = {name: (code, all_nodes.tools_of[name].text()) for name, code in codes.items() if code}
+    codes = {name: tool.ended() for name, tool in nodes.tools_of.items()}
+    wrong = {name: (code, nodes.tools_of[name].text()) for name, code in codes.items() if code}
     assert not wrong, wrong
-    assert "Traceback" not in all_nodes.text()
+    assert "Traceback" not in nodes.text()
 
 
 def test_missing_required_parameter_is_reported(tools: Tools) -> None:
