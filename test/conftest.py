@@ -52,7 +52,7 @@ def _starts_processes(path: Path) -> bool:
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Import no file that the marker expression of a phase leaves out as a whole: all of them take 8 s to import."""
-    expression = str(config.getoption("markexpr"))
+    expression = str(config.getoption("markexpr")).replace("slow or not slow", "")  # of test-all
     if "processes" not in expression or collection_path == ROOT / "test":
         return None
     if collection_path.is_dir():  # with its conftest.py
@@ -62,9 +62,10 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     if _starts_processes(collection_path) == ("not processes" in expression):
         return True
     text = collection_path.read_text(encoding="utf-8")
-    if "not alone" in expression:
-        return True if "\npytestmark = pytest.mark.alone" in text else None
-    return True if "alone" in expression and "mark.alone" not in text else None
+    marks = next((line for line in text.splitlines() if line.startswith("pytestmark = ")), "")
+    if any(f"not {name}" in expression and f"mark.{name}" in marks for name in ("alone", "slow")):
+        return True
+    return True if "alone" in expression and "not alone" not in expression and "mark.alone" not in text else None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -36,9 +36,6 @@ from body_tracking.pipeline.people import ALL as EVERYBODY
 from body_tracking.recording.replay import ReplaySettings, replay
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BagReader, deserialize, first_field
-from body_tracking.simulation.bags import write_bag
-from body_tracking.simulation.layouts import around
-from body_tracking.simulation.scene import Setup, lanes, simulate
 from draws import ALL
 from excerpts import beginning
 from pose_networks import MISSING
@@ -278,6 +275,10 @@ def test_every_stamp_of_a_live_graph_is_in_the_time_of_its_clock(played: Callabl
 
 def two_people(folder: Path) -> tuple[Path, Path]:
     """A simulated recording of two who walk past each other, and the calibration of its sensors."""
+    from body_tracking.simulation.bags import write_bag  # not by every worker: they take a second
+    from body_tracking.simulation.layouts import around
+    from body_tracking.simulation.scene import Setup, lanes, simulate
+
     recording = simulate(
         Setup(
             "walking_and_turning",

@@ -20,10 +20,11 @@ from body_tracking.camera.codecs import CompressedColour  # noqa: E402
 from body_tracking.camera.topics import people_topic  # noqa: E402
 from body_tracking.recording.rosbag2 import BAG_WIRE  # noqa: E402
 
+pytestmark = pytest.mark.alone  # the browser draws in software, on all processors
+
 ORANGE = pixels_where("high - low > 150")
 
 
-@pytest.mark.alone  # the browser draws in software, on all processors
 def test_a_browser_shows_the_images_of_a_camera_while_they_are_switched_on(tmp_path: Path) -> None:
     need_chromium()
     picture = np.full((240, 320, 3), 128, np.uint8)

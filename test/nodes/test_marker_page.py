@@ -36,6 +36,8 @@ from body_tracking.pipeline.stage import Stage  # noqa: E402
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader  # noqa: E402
 from body_tracking.ros.bag_topics import message_class  # noqa: E402
 
+pytestmark = [pytest.mark.slow, pytest.mark.alone]  # the browser draws in software, on all processors
+
 BAG, LAB = ROOT / "bags" / "markers_arm", ROOT / "config" / "marker_setup"
 STAGES = (DetectorStage, TriangulationStage, TrackerStage, AnglesOfTargetsStage)
 PAIRS = 60 if PICTURES else 5
@@ -64,8 +66,6 @@ def messages(stages: list[Stage]) -> list[dict[str, bytes]]:
     return [frames[stamp_ns] for stamp_ns in sorted(frames)]
 
 
-@pytest.mark.slow
-@pytest.mark.alone  # the browser draws in software, on all processors
 def test_a_browser_shows_balls_points_and_targets(tmp_path: Path) -> None:
     need_chromium()
     stages: list[Stage] = [stage(check_all(stage.PARAMETERS, {"setup": str(LAB)})) for stage in STAGES]

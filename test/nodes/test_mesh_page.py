@@ -33,6 +33,8 @@ from body_tracking.pipeline.offline import OfflineRunner  # noqa: E402
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, BagReader  # noqa: E402
 from body_tracking.ros.bag_topics import message_class  # noqa: E402
 
+pytestmark = [pytest.mark.slow, pytest.mark.alone]  # the browser draws in software, on all processors
+
 BAG, CAMERA = ROOT / "bags" / "mesh_reaching", "kinect1"
 INFO, IMAGES, MESH, SKELETONS = (
     info_topic(CAMERA),
@@ -65,8 +67,6 @@ def frames() -> list[dict[str, bytes]]:
     return [found[stamp_ns] for stamp_ns in sorted(found)]
 
 
-@pytest.mark.slow
-@pytest.mark.alone  # the browser draws in software, on all processors
 def test_a_browser_shows_the_mesh_and_its_image(tmp_path: Path) -> None:
     need_chromium()
     played = frames()

@@ -31,6 +31,8 @@ from body_tracking.pipeline.roles import ROLES  # noqa: E402
 from body_tracking.recording.rosbag2 import BagReader  # noqa: E402
 from body_tracking.viewing.shapes import figure  # noqa: E402
 
+pytestmark = [pytest.mark.slow, pytest.mark.alone]  # the browser draws in software, on all processors
+
 BAG = Path(__file__).resolve().parent.parent.parent / "bags" / "tpose_torso_twist"
 EVERY = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 CURVES = """() => Object.values(window.__viserTestpoints?.uplots ?? {})
@@ -65,8 +67,6 @@ def browser(tmp_path: Path) -> Iterator[Browser]:
             listener.join(10.0)
 
 
-@pytest.mark.slow
-@pytest.mark.alone  # the browser draws in software, on all processors
 def test_a_browser_shows_the_graph_and_its_buttons_work(browser: Browser, tmp_path: Path) -> None:
     running, page, clouds = browser.running, browser.page, browser.clouds
 
