@@ -27,6 +27,7 @@ import live
 import numpy as np
 import psutil
 
+from body_tracking.core.clocks import ClockModel
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.core.sources import RecordedFrame
 from body_tracking.kinect.simulated import KinectErrors
@@ -51,6 +52,9 @@ _LAYOUT = around(np.radians([45.0, -45.0, 0.0, -80.0]).tolist(), (2.0, 2.0, 2.4,
 """The two sensors of the shipped bags, one in front of the person and one far to the right."""
 _DELAYS = ((0.022, 0.003), (0.034, 0.004), (0.028, 0.003), (0.045, 0.006))
 """Delivery delay of each sensor, seconds: the least, and the mean of the random rest."""
+
+_SAME_FRAME_NS = 2_000_000
+"""Largest difference between an output's stamp and the capture of its frame: the sensors' clocks are estimated."""
 
 # The filter's counters of rejected frames.
 _REFUSED = ("too_late", "repeated_stamps", "alignment uncalibrated", "alignment other_clock", "malformed", "refused")
@@ -91,7 +95,9 @@ def up_command(folder: Path, recording: SimulatedRecording, start: float) -> lis
     bag = folder / "bag"
     write_bag(recording, bag)
     poses = {sensor.pose.sensor: sensor.pose for sensor in recording.sensors}
-    clocks = {sensor.pose.sensor: sensor.clock for sensor in recording.sensors}
+    # frames are stamped in ROS time as if the fastest of each sensor came without delay
+    least = [least for least, _ in _DELAYS]
+    clocks = {name: ClockModel(round((own - least[0]) * NANOSECONDS)) for name, own in zip(poses, least, strict=True)}
     calibration = live.calibrated(folder / "calibration.yaml", poses, clocks, 1.0)
     values = {f"{name}_skeleton": {"file": str(bag), "start_time": start} for name in poses}
     parameters = live.parameters_file(folder / "parameters.yaml", values)
@@ -198,10 +204,11 @@ def _delays(
     order = np.argsort(taken)
     times = np.array(taken)[order]
     delivered = np.array([_delivered(frame) for frame in recording.frames])[order]
-    start_ns = round(start * NANOSECONDS)
+    # the sensors play from the receipt of the first frame
+    start_ns = round(start * NANOSECONDS) - int(delivered.min())
     result = {}
     for name, received in ear.received.items():
-        stamps = np.array(sorted(received)) - START_NS
+        stamps = np.array(sorted(received)) - start_ns - round(_DELAYS[0][0] * NANOSECONDS)
         arrived = np.array([received[stamp] for stamp in sorted(received)]) - start_ns
         steady = (stamps >= begin * NANOSECONDS) & (stamps < end * NANOSECONDS)
         stamps, arrived = stamps[steady], arrived[steady]
@@ -210,7 +217,7 @@ def _delays(
         nearest = np.clip(np.searchsorted(times, stamps), 1, len(times) - 1)
         nearest -= stamps - times[nearest - 1] < times[nearest] - stamps
         # outputs without a frame are predicted, or the calibration has moved a clock
-        known = np.abs(times[nearest] - stamps) < 20_000
+        known = np.abs(times[nearest] - stamps) < _SAME_FRAME_NS
         row: dict[str, float] = {"count": len(stamps), "matched": int(known.sum())}
         for since, values in (("capture", arrived - stamps), ("delivery", (arrived - delivered[nearest])[known])):
             for key, percent in (("median", 50), ("p99", 99)):
