@@ -307,6 +307,19 @@ def test_the_standard_deviation_grows_towards_a_singular_pose(name: str) -> None
         before = deviations[first]
 
 
+@pytest.mark.parametrize("ratio", [0.1, 0.3, 0.5, 0.7])
+def test_near_a_singular_pose_95_percent_are_within_1_96_deviations(ratio: float) -> None:
+    """To first order they are not: at a deviation of 40 degrees errors of 110 were stated to be impossible."""
+    stddev = 5.0 * DEGREE
+    away = np.degrees(np.arcsin(stddev / ratio))
+    angles = angles_of(estimate(arms(0.0, 90.0 - away), stddev), MODEL, "model")
+    first, middle, last = (angles.position_stddev[angles.names.index(key)] for key in OUTER["model"])
+    direction = np.random.default_rng(1).normal(size=(200_000, 2)) + (1.0 / ratio, 0.0)
+    half_width = np.quantile(np.abs(np.arctan2(direction[:, 1], direction[:, 0])), 0.95)
+    np.testing.assert_allclose((1.96 * first, middle), (half_width, stddev), rtol=0.05)
+    assert last > 0.95 * first
+
+
 def _path(kind: str, offset: float) -> list[FloatArray]:
     """An arm that swings through a pose and a little past it, degrees per step at most 3."""
     steps = np.arange(-60.0, 15.0 if kind == "up" else 60.1, 3.0)  # an arm does not go far behind straight up
