@@ -95,9 +95,9 @@ def up_command(folder: Path, recording: SimulatedRecording, start: float) -> lis
     bag = folder / "bag"
     write_bag(recording, bag)
     poses = {sensor.pose.sensor: sensor.pose for sensor in recording.sensors}
-    # frames are stamped in ROS time as if the fastest of each sensor came without delay
-    least = [least for least, _ in _DELAYS]
-    clocks = {name: ClockModel(round((own - least[0]) * NANOSECONDS)) for name, own in zip(poses, least, strict=True)}
+    # stamps are in ROS time, as if the fastest frame of each sensor came without delay
+    offsets = [least - _DELAYS[0][0] for least, _ in _DELAYS]
+    clocks = {name: ClockModel(round(offset * NANOSECONDS)) for name, offset in zip(poses, offsets, strict=True)}
     calibration = live.calibrated(folder / "calibration.yaml", poses, clocks, 1.0)
     values = {f"{name}_skeleton": {"file": str(bag), "start_time": start} for name in poses}
     parameters = live.parameters_file(folder / "parameters.yaml", values)

@@ -170,7 +170,7 @@ class Convention:
         values = np.zeros(self._size)
         values[self._scalar_row] = estimate.q[self._scalar]
         gradients, rates = self._identity.copy(), self._identity.copy()
-        doubt, curvature = np.zeros(self._size), np.zeros(self._size)
+        doubt, second_order = np.zeros(self._size), np.zeros(self._size)
         for stage, (sequences, parents, children, rows) in enumerate(self.stages):
             if stage == 1 and self._frames:
                 rotations, turning = self._extend(rotations, turning, values, gradients)
@@ -184,12 +184,12 @@ class Convention:
             )
             values[rows] = split.angles.reshape(-1)
             doubt[rows] = np.repeat(split.doubt, 3)
-            curvature[rows] = np.outer(split.curvature, (1.0, 0.0, 1.0)).reshape(-1)
+            second_order[rows] = np.outer(split.second_order, (1.0, 0.0, 1.0)).reshape(-1)
             gradients[rows] = (split.gradients @ turned).reshape(-1, nv - 6)
             rates[rows] = (split.rates @ turned).reshape(-1, nv - 6)
 
         gradient, rate_gradient = gradients[self.rows], rates[self.rows]
-        further = (doubt * UNIFORM_STDDEV) ** 2 + curvature
+        further = (doubt * UNIFORM_STDDEV) ** 2 + second_order
         stddev = np.sqrt(_stddev(gradient, covariance, unknown) ** 2 + further[self.rows])
         lost_angle = self._redundant | np.isinf(stddev)
         velocity_stddev = _stddev(gradient, velocity_covariance, unknown_rate)

@@ -79,15 +79,15 @@ class Split:
         gradients: (n, 3, 3) of the angles by the angular velocity, in the parent's frame; huge at a singular pose.
         rates: (n, 3, 3) the same for the angles as they are held near a singular pose.
         doubt: (n,) from 0 to 1: how near the three angles are to a jump back into their usual ranges.
-        curvature: (n,) square radians by which the first and the third angle vary more than ``gradients`` says, near a
-            singular pose; see :meth:`EulerSequences.split`.
+        second_order: (n,) square radians: variance of the first and of the third angle beyond that of ``gradients``,
+            near a singular pose; see :meth:`EulerSequences.split`.
     """
 
     angles: FloatArray
     gradients: FloatArray
     rates: FloatArray
     doubt: FloatArray
-    curvature: FloatArray
+    second_order: FloatArray
 
 
 class EulerSequences:
@@ -122,9 +122,9 @@ class EulerSequences:
 
         The first angle is the direction in which an axis leaves that of the singular pose. At a sine d from there,
         known with a deviation s, its deviation is to first order r = s / d. It is the angle of a normal distribution in
-        the plane, with the mean (d, 0): 95 % of it lie within 1.96 sqrt(r^2 + 2 r^4), up to 4 % for r up to 0.7 (by
-        simulation; within less beyond). The third angle turns with it. On the sphere r^4 has the factor 1 - d^2, for
-        there is no such effect a quarter turn away.
+        the plane with the mean (d, 0), whose 95 % interval has the half width 1.96 sqrt(r^2 + 2 r^4) to 4 % while r is
+        below 0.7 (by simulation; for larger r the formula gives too much). The third angle turns with the first. The
+        term in r^4 has the factor 1 - d^2: a quarter turn from the singular pose the relation is linear.
 
         Args:
             rotations: (n, 3, 3) of a child in its parent.
@@ -165,8 +165,8 @@ class EulerSequences:
         chosen, best, beyond = self._choose(angles, previous, _SURE**2 / (_SURE**2 + last))
         derivatives = self._derivatives(np.where(best, parts[:, 0], parts[:, 1]), distance, hold)
         square = np.maximum(distance**2, 1e-18)
-        curvature = 2.0 * np.square(tilt / square) * np.maximum(1.0 - square, 0.0)
-        return Split(chosen, *derivatives, np.clip(2.0 * beyond / self._margin - 1.0, 0.0, 1.0), curvature)
+        second_order = 2.0 * np.square(tilt / square) * np.maximum(1.0 - square, 0.0)
+        return Split(chosen, *derivatives, np.clip(2.0 * beyond / self._margin - 1.0, 0.0, 1.0), second_order)
 
     def _choose(
         self, angles: FloatArray, previous: FloatArray | None, weight: FloatArray

@@ -69,6 +69,8 @@ def test_every_node_publishes_diagnostics(nodes: Nodes) -> None:
 
 def test_every_service_answers(nodes: Nodes) -> None:
     services = [each.name for each in systems.SERVICES if each.executable in nodes.tools_of]
+    if not services:
+        pytest.skip("no node of this group has a service")
     # The recorder is to start before it stops.
     first, later = [name for name in services if "start" in name], [name for name in services if "start" not in name]
     for name in (*first, *some(later)):
