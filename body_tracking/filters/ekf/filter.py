@@ -314,14 +314,14 @@ class ExtendedKalmanFilter:
         positions = np.where(measured[:, None], corrected[joints], 0.0)
         states = skeleton.states[joints]
         inferred = np.where(states == _TRACKED, 1.0, INFERRED_FACTOR**2)
-        model = self._space.base_variance * inferred
+        base = model = self._space.base_variance * inferred
         if skeleton.covariances is not None:
             given = skeleton.covariances[joints]
             diagonal = given.diagonal(axis1=1, axis2=2)
             # a sum is finite where all its numbers are
             sound = (diagonal > 0.0).all(axis=1) & (np.abs(given).sum(axis=(1, 2)) < _MAX_COORDINATE**2)
             model = np.where(sound, diagonal.mean(axis=1), model)
-        return Measurement(sensor, skeleton.stamp_ns, positions, measured, model, skeleton)
+        return Measurement(sensor, skeleton.stamp_ns, positions, measured, model, base, skeleton)
 
     def _in_time(self, measurement: Measurement, state: State) -> bool:
         """Whether to take a frame; a jump of time, a gap or another frame of reference reset the filter."""
@@ -527,14 +527,18 @@ class ExtendedKalmanFilter:
         by_sensor = [each for each in self._waiting if each.sensor == measurement.sensor]
         if len(by_sensor) < _START_FRAMES:
             return None
+        alone = len(by_sensor) == len(self._waiting)
         sensors: dict[str, SensorState] = {}
         for each in self._waiting:
-            known = sensors.get(each.sensor) or self._sensors.unknown(each, len(by_sensor) == len(self._waiting))
-            known = self._sensors.seen_by(known, each, each.measured)
+            known = sensors.get(each.sensor) or self._sensors.unknown(each, alone)
+            known = self._sensors.seen_by(known, each, each.measured, sensors)
             slow = max(known.slow, self._sensors.least_slow(known.white, each))
             sensors[each.sensor] = known.but(slow=slow)
         # keep the noise only: the frames themselves are processed below
-        learnt = {name: sensor.but(stamps=(), positions=sensor.positions[:0]) for name, sensor in sensors.items()}
+        learnt = {
+            name: sensor.but(stamps=(), positions=sensor.positions[:0], least_stated=np.inf)
+            for name, sensor in sensors.items()
+        }
         first, *others = self._waiting
         self._waiting = []
         state = self._poses.first_state(first, None, learnt)

@@ -79,7 +79,7 @@ class PoseSearch:
         state = self.new_state(measurement.stamp_ns, fit.q, lengths, stddev, previous)
         state = state.but(fresh=True, sensors=state.sensors if learnt is None else learnt)
         sensor = state.sensors.get(measurement.sensor) or self._sensors.unknown(measurement)
-        sensor = self._sensors.seen_by(sensor, measurement, measurement.measured)
+        sensor = self._sensors.seen_by(sensor, measurement, measurement.measured, state.sensors)
         return state.but(sensors={**state.sensors, measurement.sensor: sensor})
 
     def new_state(

@@ -134,7 +134,7 @@ class SkeletonUpdate:
             disputed=self._disputed(state, measurement, seen.innovation, rejected_for),
             used_ns=np.where(used, measurement.stamp_ns, state.used_ns),
         )
-        learnt = self._sensors.seen_by(sensor, measurement, used)
+        learnt = self._sensors.seen_by(sensor, measurement, used, state.sensors)
         if not count:
             return state.but(sensors={**state.sensors, measurement.sensor: learnt})
 
@@ -201,13 +201,14 @@ class SkeletonUpdate:
             if foreseeable  # otherwise the linearisation errs by more than the sensor
             else (sensor.slow, sensor.slow_estimate, sensor.slow_information)
         )
+        learnt = learnt.but(slow=slow_scale, slow_estimate=slow_estimate, slow_information=information)
         if slow_scale != sensor.slow and sensor.slow > 0.0:
             # Scale the slow errors' contribution to the covariance by the same ratio.
-            ratio = slow_scale / sensor.slow
+            old, new = (self._sensors.slow_variance(each, measurement) for each in (sensor, learnt))
+            ratio = (new / old).repeat(3)
             own_cross = crosses[:, place : place + 3 * space.points]
             covariance -= (1.0 - ratio) * own_cross @ own_cross.T
-            own_cross *= np.float32(math.sqrt(ratio))
-        learnt = learnt.but(slow=slow_scale, slow_estimate=slow_estimate, slow_information=information)
+            own_cross *= np.sqrt(ratio, dtype=np.float32)
         return state.but(
             q=self._model.integrate(state.q, correction[space.tangent]),
             lengths=state.lengths + correction[space.lengths],

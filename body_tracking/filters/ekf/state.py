@@ -45,6 +45,7 @@ class Measurement:
         positions: (19, 3) metres in world; 0 where not measured.
         measured: (19,) which points are measured.
         model_variance: (19,) square metres per axis by the measurement model, of white and slow errors together.
+        base_variance: (19,) the same of a person who faces a Kinect v2 at 2 m, with these tracking states.
         skeleton: the frame as received.
     """
 
@@ -53,6 +54,7 @@ class Measurement:
     positions: FloatArray
     measured: BoolArray
     model_variance: FloatArray
+    base_variance: FloatArray
     skeleton: Skeleton
 
 
@@ -70,6 +72,8 @@ class SensorState(Changeable):
         slow_estimate: running estimate of this scale, used only if significant.
         slow_information: of the running estimate.
         stated: whether its skeletons bring covariances, which include the systematic error.
+        least_stated: the least that it stated lately, as a multiple of ``Measurement.base_variance``; infinity of a
+            single sensor.
     """
 
     stamps: tuple[int, ...]
@@ -81,6 +85,7 @@ class SensorState(Changeable):
     slow_estimate: float
     slow_information: float
     stated: bool
+    least_stated: float
 
 
 @dataclass(frozen=True, eq=False)
