@@ -57,7 +57,7 @@ class Registration:
         points = self._view.points(depth).reshape(-1, 3)
         moved = self._pose.apply(points[np.isfinite(points[:, 2])].astype(np.float64))
         pixels = self.camera.project(moved)
-        return _splat(pixels, moved[:, 2], self.camera.height, self.camera.width)
+        return _splat(pixels, moved[:, 2].copy(), self.camera.height, self.camera.width)
 
 
 @compiled

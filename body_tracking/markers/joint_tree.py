@@ -210,5 +210,7 @@ def differentiate(tree: Tree, posture: Posture, rotations: FloatArray, parameter
 def errors(poses: PoseTable, rotations: FloatArray, translations: FloatArray) -> FloatArray:
     """(n, m, 6) translation and rotation (w of ``exp(w) @ rotation``) from the tree's poses to the measured ones."""
     result = np.empty((*rotations.shape[:2], 6))
-    tree_loops.errors(poses.rotations, poses.translations, poses.seen, rotations, translations, result)
+    # contiguous: the type compiled ahead
+    measured = np.ascontiguousarray(poses.rotations), np.ascontiguousarray(poses.translations)
+    tree_loops.errors(*measured, np.ascontiguousarray(poses.seen), rotations, translations, result)
     return result

@@ -75,7 +75,8 @@ def umeyama(model: FloatArray, measured: FloatArray, weights: FloatArray) -> tup
         (b, 3, 3) and (b, 3) with ``measured = rotation @ model + translation``.
     """
     rotations, translations = np.empty((len(model), 3, 3)), np.empty((len(model), 3))
-    model, measured, weights = map(np.ascontiguousarray, (model, measured, weights))
+    # one type, compiled ahead: a read-only array is of another one
+    model, measured, weights = (np.require(each, requirements=["C", "W"]) for each in (model, measured, weights))
     _fitted(model, measured, weights, rotations, translations)
     return rotations, translations
 

@@ -81,7 +81,8 @@ class Track:
         """(k, n) whether a point lies within the gate of a ball's predicted position."""
         # the trace bounds the balls' own covariance for any rotation of the target
         own = target.covariance.diagonal().reshape(-1, 3).sum(axis=1)
-        return _gates(target.points @ self.rotation.T, own, *self._numbers[1::2], points.positions, points.covariance)
+        positions = np.ascontiguousarray(points.positions)  # the type compiled ahead
+        return _gates(target.points @ self.rotation.T, own, *self._numbers[1::2], positions, points.covariance)
 
     @property
     def _numbers(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

@@ -482,7 +482,8 @@ class MeshFitter:
         for axis in range(3):
             direction = np.zeros_like(offsets)
             direction[:, axis] = 1.0
-            system.add(arms, direction, offsets[:, axis], weights)
+            # contiguous: the type compiled ahead
+            system.add(arms, direction, offsets[:, axis].copy(), weights)
         return float((weights[:, None] * offsets * offsets).sum())
 
 

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from body_tracking.markers import pose
 from body_tracking.markers.observations import Points
-from body_tracking.markers.pose import PoseError, fit_pose
+from body_tracking.markers.pose import PoseError, fit_pose, umeyama
 from body_tracking.markers.targets import Target
 from body_tracking.simulation.target_points import TARGET_POINTS, measure, random_rotation, rotation_error
 from draws import draws
@@ -98,3 +99,17 @@ def test_refuses_what_gives_no_pose() -> None:
     ):
         with pytest.raises(PoseError, match=text):
             fit_pose(target, given, assignment)
+
+
+def test_points_in_any_layout_of_memory_need_no_other_machine_code() -> None:
+    """Each type of array takes five seconds of compiling, in which a node would not answer."""
+    rng = np.random.default_rng(4)
+    points, weights = rng.normal(size=(2, 5, 3)), np.ones((2, 5))
+    read_only, columns = points.copy(), np.asfortranarray(points)
+    read_only.flags.writeable = False
+    expected = umeyama(points, points, weights)
+    compiled = len(pose._fitted.signatures)  # type: ignore[attr-defined]
+    for other in (read_only, columns):
+        for found, same in zip(umeyama(other, other, weights), expected, strict=True):
+            assert np.allclose(found, same, rtol=0.0, atol=1e-15)
+    assert len(pose._fitted.signatures) == compiled  # type: ignore[attr-defined]
