@@ -1,6 +1,7 @@
 """Write what the code defines: the tables of docs/reference.md and benchmarks/README.md, and the files in config/.
 
-With ``--check`` it only says whether they are up to date.
+The table in README.md has medians of docs/accuracy.md, which ``benchmarks/accuracy.py --write`` writes. With
+``--check`` it only says whether they are up to date.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from body_tracking import cli, systems
@@ -20,6 +21,8 @@ from body_tracking.pipeline.roles import ROLES
 
 ROOT = Path(__file__).resolve().parent.parent
 REFERENCE = ROOT / "docs" / "reference.md"
+README = ROOT / "README.md"
+ACCURACY = ROOT / "docs" / "accuracy.md"
 CONFIG = ROOT / "config" / "body_tracking.yaml"
 SIMULATOR = ROOT / "config" / "simulator.yaml"
 BENCHMARKS = ROOT / "benchmarks" / "README.md"
@@ -56,6 +59,34 @@ GROUPS = {
     "Diagnostics": ("every node",),
 }
 """Heading -> the nodes whose topics stand below it, in the order in which a user looks for them."""
+ACCURACY_COLUMNS = {
+    "one sensor": "one sensor",
+    "thesis": "thesis LKF2",
+    "`lkf_constant_velocity`": "default (lkf_constant_velocity)",
+    "`ekf`": "ekf",
+}
+"""Column of the table in README.md -> that of docs/accuracy.md."""
+ACCURACY_ROWS = {
+    "elbow flexion, RMSE, degrees": ("Elbow flexion, RMSE in degrees", 1.0, "{:.1f}"),
+    "shoulder elevation, RMSE, degrees": ("Shoulder elevation, RMSE in degrees", 1.0, "{:.1f}"),
+    "joint positions, mean 3D error, mm": ("Mean 3D error, mm", 1.0, "{:.0f}"),
+    "the same without each joint's constant offset, mm": (
+        "Mean 3D error without each joint's constant offset, mm",
+        1.0,
+        "{:.0f}",
+    ),
+    "elbow: truth within 1.96 standard deviations (ideal: 95 %)": (
+        "Elbow flexion: share of errors within 1.96 standard deviations",
+        100.0,
+        "{:.0f} %",
+    ),
+    "shoulder: truth within 1.96 standard deviations": (
+        "Shoulder elevation: share of errors within 1.96 standard deviations",
+        100.0,
+        "{:.0f} %",
+    ),
+}
+"""Row of the table in README.md -> the heading in docs/accuracy.md, a factor and the format of a value."""
 SECTION = re.compile(r"(<!-- (\w+): written by make docs -->\n).*?(<!-- end of \2 -->)", re.DOTALL)
 
 
@@ -65,9 +96,9 @@ def _cell(text: str) -> str:
     return "`".join(part if i % 2 else part.replace("<", "&lt;") for i, part in enumerate(parts))
 
 
-def table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table."""
-    lines = [titles, ["---"] * len(titles), *rows]
+def table(titles: Sequence[str], rows: Iterable[Sequence[str]], *, numbers: bool = False) -> str:
+    """A Markdown table; ``numbers`` aligns all columns but the first at the right."""
+    lines = [titles, ["---"] + ["---:" if numbers else "---"] * (len(titles) - 1), *rows]
     return "".join("| " + " | ".join(map(_cell, line)) + " |\n" for line in lines)
 
 
@@ -180,6 +211,25 @@ def commands() -> str:
     return table(("command", "what it does"), _commands())
 
 
+def _medians(heading: str) -> dict[str, str]:
+    """Column -> median over the motions, of the table below a heading of docs/accuracy.md."""
+    text = ACCURACY.read_text(encoding="utf-8")
+    found = re.search(rf"^### {re.escape(heading)}\n\n(.*)\n.*\n(?:\|.*\n)*?(\| \*\*median\*\*.*)", text, re.MULTILINE)
+    if found is None:
+        raise SystemExit(f"{ACCURACY.name} has no table of medians below {heading!r}")
+    titles, values = ([cell.strip(" *") for cell in line.split("|")] for line in found.groups())
+    return dict(zip(titles, values, strict=True))
+
+
+def accuracy() -> str:
+    """The medians over the motions, of simulated people."""
+    rows = []
+    for title, (heading, factor, form) in ACCURACY_ROWS.items():
+        values = (_medians(heading)[column] for column in ACCURACY_COLUMNS.values())
+        rows.append((title, *(value if value == "-" else form.format(factor * float(value)) for value in values)))
+    return table(("", *ACCURACY_COLUMNS), rows, numbers=True)
+
+
 WRITERS = {
     "topics": topics,
     "services": services,
@@ -190,13 +240,13 @@ WRITERS = {
 }
 
 
-def reference() -> str:
-    """The text of docs/reference.md with its tables as the code defines them now."""
-    text = REFERENCE.read_text(encoding="utf-8")
-    missing = WRITERS.keys() - {match[2] for match in SECTION.finditer(text)}
+def written(path: Path, writers: Mapping[str, Callable[[], str]]) -> str:
+    """The text of a page with its tables as they are now."""
+    text = path.read_text(encoding="utf-8")
+    missing = writers.keys() - {match[2] for match in SECTION.finditer(text)}
     if missing:
-        raise SystemExit(f"{REFERENCE.name} has no place for {', '.join(sorted(missing))}")
-    return SECTION.sub(lambda match: f"{match[1]}{WRITERS[match[2]]()}{match[3]}", text)
+        raise SystemExit(f"{path.name} has no place for {', '.join(sorted(missing))}")
+    return SECTION.sub(lambda match: f"{match[1]}{writers[match[2]]()}{match[3]}", text)
 
 
 def benchmarks() -> str:
@@ -210,7 +260,13 @@ def benchmarks() -> str:
 def files() -> dict[Path, str]:
     """The text of each file as the code defines it now."""
     simulator = f"{SIMULATOR_HEADER}\n{kinect.errors_as_yaml()}"
-    return {REFERENCE: reference(), CONFIG: systems.config_text(), SIMULATOR: simulator, BENCHMARKS: benchmarks()}
+    return {
+        README: written(README, {"accuracy": accuracy}),
+        REFERENCE: written(REFERENCE, WRITERS),
+        CONFIG: systems.config_text(),
+        SIMULATOR: simulator,
+        BENCHMARKS: benchmarks(),
+    }
 
 
 def main() -> int:
