@@ -13,6 +13,7 @@ DEMO_MESH := demo_mesh_output
 SITE_VENV := .site_venv
 CAMERA_BAG := bags/camera_reaching
 DEMO_CAMERA := demo_camera_output
+DEMO_IMUS := demo_imus_output
 
 # Nothing of a sourced ROS install or of another virtual environment may leak into this one. The ROS wheels re-execute
 # Python once to find their libraries and mark that in the environment; with another environment's mark set they
@@ -33,7 +34,7 @@ export MPLBACKEND := Agg
 export PYTHONUNBUFFERED := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo demo-markers demo-mesh demo-camera test test-all lint ros2-workspace bench docs site clean
+.PHONY: help setup demo demo-markers demo-mesh demo-camera demo-imus test test-all lint ros2-workspace bench docs site clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z0-9-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 16
@@ -81,9 +82,15 @@ demo-mesh: $(STAMP) ## the same with depth images: from the mesh of a body to jo
 
 demo-camera: $(STAMP) ## the same with colour and depth images: from the people in them to joint angles
 	@rm -rf $(DEMO_CAMERA) && mkdir $(DEMO_CAMERA)
-	$(BIN)/body_tracking up --bag $(CAMERA_BAG) --camera camera1 --compressed colour --record $(DEMO_CAMERA)/recording --log-dir $(DEMO_CAMERA)/log
+	$(BIN)/body_tracking up --bag $(CAMERA_BAG) --camera camera1 --compressed colour --filter ekf --record $(DEMO_CAMERA)/recording --log-dir $(DEMO_CAMERA)/log
 	$(BIN)/body_tracking show $(DEMO_CAMERA)/recording --truth $(CAMERA_BAG) --output $(DEMO_CAMERA)/joint_angles.png
 	@echo "recording: $(DEMO_CAMERA)/recording"
+
+demo-imus: $(STAMP) ## the same with inertial sensors on the left arm of a simulated person, beside two Kinects; offline
+	@rm -rf $(DEMO_IMUS) && mkdir $(DEMO_IMUS)
+	$(BIN)/body_tracking simulate -o $(DEMO_IMUS)/person --imus forearm_left,upper_arm_left
+	$(BIN)/body_tracking replay $(DEMO_IMUS)/person -o $(DEMO_IMUS)/angles --filter ekf --convention isb --imus forearm_left:imu_forearm_left --imus upper_arm_left:imu_upper_arm_left
+	$(BIN)/body_tracking show $(DEMO_IMUS)/angles --truth $(DEMO_IMUS)/person --output $(DEMO_IMUS)/joint_angles.png
 
 # The tests that compute, and lint, take what is left of the processors by those that start processes. These wait more than
 # they compute: four run at a time, and one at a time where they state how soon something happens (these first, since they
@@ -134,5 +141,5 @@ site: $(SITE_VENV)/.installed ## these pages as a site in build/site
 	@echo "site: build/site/index.html"
 
 clean: ## remove everything that make and colcon made
-	rm -rf $(VENV) $(SITE_VENV) $(DEMO) $(DEMO_MARKERS) $(DEMO_MESH) $(DEMO_CAMERA) .ros2_workspace build install log dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) $(SITE_VENV) $(DEMO) $(DEMO_MARKERS) $(DEMO_MESH) $(DEMO_CAMERA) $(DEMO_IMUS) .ros2_workspace build install log dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find . -name __pycache__ -not -path './.git/*' -prune -exec rm -rf {} +

@@ -17,6 +17,7 @@ from body_tracking.evaluation.comparison import MAX_GAP, AngleComparison, Evalua
 from body_tracking.evaluation.metrics import angle_errors, wrapped
 from body_tracking.evaluation.reading import AngleSeries, Tracked, nearest, true_at
 from body_tracking.evaluation.report import named_are_positional, write
+from body_tracking.kinematics.labels import limb_of
 
 _COLOURS = {"left": "#1f6fb4", "right": "#d1571b", "": "#3a3a3a"}
 _COLUMNS, _INSTANTS = 4, 6
@@ -123,7 +124,9 @@ def _label(axis: Any, title: str) -> None:
 
 
 def _side(name: str) -> str:
-    return next((side for side in ("left", "right") if name.endswith(f"_{side}")), "")
+    """The side of an angle's limb; empty of the trunk's, whose names may end with a direction."""
+    side = limb_of(name).partition(" ")[0]
+    return side if side in ("left", "right") else ""
 
 
 def _panels(names: tuple[str, ...]) -> dict[str, list[int]]:

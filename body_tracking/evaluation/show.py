@@ -13,6 +13,9 @@ from body_tracking.evaluation.pictures import are_fine, draw
 from body_tracking.evaluation.reading import AngleSeries, read, true_at
 from body_tracking.evaluation.report import Column, Table, make_folder
 
+_ENOUGH = 0.02
+"""Least share of the frames for statistics of an angle's error."""
+
 
 def summary(angles: AngleSeries, truth: AngleSeries | None = None) -> Table:
     """Table with a row per angle, degrees.
@@ -34,18 +37,22 @@ def summary(angles: AngleSeries, truth: AngleSeries | None = None) -> Table:
         errors = angle_errors(known, true)
         within = np.where(np.isfinite(error), np.abs(error) <= 2.0 * angles.stddev, np.nan)
         share = np.nansum(within, axis=0) / np.maximum(errors.frames, 1)
+        scarce = errors.frames < _ENOUGH * len(known)
         columns += [
             *_range("true ", np.where(np.isfinite(error), true, np.nan)),
-            Column("rms_error", "rms err", "deg", np.degrees(errors.rmse)),
-            Column("max_error", "max err", "deg", np.degrees(errors.largest)),
-            Column("within_2_stddev", "in 2 sd", "%", np.where(errors.frames > 0, 1e2 * share, np.nan)),
+            Column("rms_error", "rms err", "deg", np.where(scarce, np.nan, np.degrees(errors.rmse))),
+            Column("max_error", "max err", "deg", np.where(scarce, np.nan, np.degrees(errors.largest))),
+            Column("within_2_stddev", "in 2 sd", "%", np.where(scarce, np.nan, 1e2 * share)),
         ]
     if are_fine(angles):
         columns = [each._replace(digits=3) if each.unit == "deg" else each for each in columns]
     note = "stddev: median" + (", inf if unknown in most frames" if np.isinf(columns[3].values).any() else "")
-    note += ". finite: share of the frames with an angle, however large its stddev (evaluate: known below 30 deg)."
+    note += ". finite: share of the frames with an angle, however large its stddev."
     if np.isfinite(error).any():
-        note += "\nFrom true min on: of frames with a truth. in 2 sd: errors within two stddev; 95 % is ideal."
+        note += (
+            "\nFrom true min on: of frames with a truth, errors where an angle is known in 2 % of the frames or more. "
+            "in 2 sd: errors within two stddev; 95 % is ideal."
+        )
     return Table("angles", "angle", angles.names, tuple(columns), note)
 
 

@@ -23,6 +23,8 @@ from body_tracking.recording.replay import sensor_topics, skeletons_of
 from body_tracking.recording.rig import RigReader
 from body_tracking.systems import all_nodes_for, nodes_for, options_of
 
+_LARGE_RESIDUAL = 0.15
+"""Metres: median residual that is warned of; nine real pairs of Kinects have 0.03 to 0.11."""
 HISTORY_S = 600.0
 """Seconds of raw frames kept: a recording up to this length is interpolated again with the final clock."""
 
@@ -151,6 +153,11 @@ def run(args: argparse.Namespace) -> int:
             print(
                 f"warning: {name}: the yaw is uncertain (good is below {limit:.1f} deg); record more motion, or other "
                 "poses, with all of the person in view of both sensors"
+            )
+        if quality.residual > _LARGE_RESIDUAL:
+            print(
+                f"warning: {name}: a residual of {1e3 * quality.residual:.0f} mm is large (real pairs have 30 to 110); "
+                "the sensors may see different people, or one takes the back for the front"
             )
     if args.output is not None:
         print(f"saved to {args.output}")

@@ -12,8 +12,6 @@ from typing import Final, TypeAlias
 from body_tracking.ros import dds
 from body_tracking.ros.up import flags, has_sensors
 
-_PATIENCE: Final = 1.5
-"""Seconds for sensors to be discovered."""
 _SHOWN: Final = 3
 """Recordings that are named at most."""
 
@@ -45,11 +43,11 @@ def steps(folder: Path) -> Iterator[Step]:
 
 def _domain(page: str) -> Iterator[Step]:
     """The next step by the nodes that publish in the ROS domain."""
-    from body_tracking.ros.discovery import look
+    from body_tracking.ros.discovery import PATIENCE, look
 
     dds.stay_on_this_machine()
     dds.prepare()
-    found = look(patience=_PATIENCE)
+    found = look()
     if found.runs:
         yield (
             "A graph runs. Find out what is wrong with it, and which services it has:",
@@ -67,7 +65,8 @@ def _domain(page: str) -> Iterator[Step]:
     else:
         name = os.environ.get("ROS_DOMAIN_ID") or "0"
         yield (
-            f"No sensor publishes in ROS domain {name}. Once yours do, start the graph with them:",
+            f"No sensor publishes in ROS domain {name} (none in {PATIENCE:.0f} s). "
+            "Once yours do, start the graph with them:",
             (f"body_tracking up{page}",),
         )
 

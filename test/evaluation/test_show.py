@@ -17,6 +17,7 @@ from body_tracking.core.skeleton import N_JOINTS, FloatArray, Skeleton, Tracking
 from body_tracking.evaluation import pictures
 from body_tracking.evaluation.comparison import AngleComparison
 from body_tracking.evaluation.metrics import angle_errors
+from body_tracking.evaluation.pictures import _panels, _side
 from body_tracking.evaluation.reading import AngleSeries, EvaluationError, Tracked, nearest, read
 from body_tracking.evaluation.show import summarise, summary
 from body_tracking.filters import make_filter
@@ -98,6 +99,20 @@ def test_the_note_explains_the_columns_that_are_there() -> None:
     angles = series([10.0, 20.0], [1.0, 40.0])
     assert "finite:" in summary(angles).note and "in 2 sd:" not in summary(angles).note
     assert "in 2 sd:" in summary(angles, series([11.0, 20.0], [0.0, 0.0])).note
+
+
+def test_an_angle_known_in_single_frames_has_no_statistics_of_its_errors() -> None:
+    estimates = np.full(200, np.nan)
+    estimates[:2] = 90.0
+    rare = summary(series(list(estimates), [1.0] * 200), series([0.0] * 200, [0.0] * 200)).row("knee")
+    assert rare["max"] == 90.0
+    assert np.isnan([rare["rms_error"], rare["max_error"], rare["within_2_stddev"]]).all()
+
+
+def test_the_trunk_has_no_side_although_its_names_end_with_directions() -> None:
+    names = ("thorax_lateral_right", "thorax_axial_left", "elbow_flexion_left", "elbow_flexion_right")
+    assert _panels(names) == {"thorax lateral right": [0], "thorax axial left": [1], "elbow flexion": [2, 3]}
+    assert [_side(name) for name in names] == ["", "", "left", "right"]
 
 
 def test_the_note_says_what_an_infinite_deviation_means() -> None:

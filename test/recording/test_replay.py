@@ -38,7 +38,7 @@ from body_tracking.messages.diagnostics import diagnostics
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.offline import OfflineRunner
-from body_tracking.recording import forked
+from body_tracking.recording import calibrate, forked
 from body_tracking.recording.forked import Downstream, ForkedDownstream
 from body_tracking.recording.importer import import_files
 from body_tracking.recording.replay import ReplayError, ReplaySettings, replay
@@ -392,7 +392,9 @@ def test_a_replay_names_its_filter_and_that_of_the_recorded_graph(tmp_path: Path
     assert contents(tmp_path / "out") == contents(tmp_path / "plain")
 
 
-def test_calibrate_prints_poses_and_clocks(wave: Path, tmp_path: Path, command: Command) -> None:
+def test_calibrate_prints_poses_and_clocks(
+    wave: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with RigReader(BAG) as bag:
         transforms = [deserialize(TRANSFORM, raw.cdr) for raw in bag.messages([graph.TRUE_CALIBRATION])]
         references = [deserialize(TIME_REFERENCE, raw.cdr) for raw in bag.messages([graph.TRUE_CLOCK])]
@@ -428,7 +430,10 @@ def test_calibrate_prints_poses_and_clocks(wave: Path, tmp_path: Path, command: 
     strict = tmp_path / "strict.yaml"
     strict.write_text("calibration:\n  ros__parameters:\n    max_rotation_stddev: 0.001\n")
     assert "warning" not in command("calibrate", BAG)[1]
-    assert "warning: kinect2: the yaw is uncertain" in command("calibrate", BAG, "--params-file", strict)[1]
+    monkeypatch.setattr(calibrate, "_LARGE_RESIDUAL", 0.01)
+    warned = command("calibrate", BAG, "--params-file", strict)[1]
+    assert "warning: kinect2: the yaw is uncertain" in warned
+    assert re.search(r"^warning: kinect2: a residual of \d+ mm is large", warned, re.MULTILINE)
     # A saved calibration can be used from the first frame on.
     brief = beginning(BAG, tmp_path / "brief", 2.0)
     code, out, error = command(
