@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -13,6 +15,7 @@ from typing import Any
 from std_srvs.srv import Trigger
 
 from body_tracking.core import names
+from body_tracking.core.clocks import jumped_back
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.parameters import Parameter, Value
 from body_tracking.core.qos import LATCHED, Qos, request_for
@@ -74,6 +77,20 @@ _MESSAGE_BYTES = 250
 """Approximate memory of a waiting message without its content."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Input:
+    """A recorded topic: its type, what its publishers offer, what is requested of them, and the subscription."""
+
+    type_name: str
+    offered: tuple[Qos, ...]
+    request: Qos
+    subscription: Any
+
+    @property
+    def latched(self) -> bool:
+        return self.request.durability == LATCHED.durability
+
+
 class BagRecorder(GraphNode):
     """Records one bag; recording can be stopped and continued."""
 
@@ -83,6 +100,7 @@ class BagRecorder(GraphNode):
     def configure(self, values: Mapping[str, Value]) -> None:
         given: dict[str, Any] = dict(values)
         self.folder = Path(given["folder"] or f"body_tracking_{datetime.now():%Y_%m_%d-%H_%M_%S}").expanduser()
+        self.first = self.folder
         self.chosen = frozenset(map(self.resolve_topic_name, given["topics"]))
         self.exclude = frozenset(map(self.resolve_topic_name, given["exclude"]))
         self.model_covariance = bool(given["model_covariance"])
@@ -96,13 +114,14 @@ class BagRecorder(GraphNode):
     def start(self) -> None:
         given: dict[str, Any] = dict(self.values)
         self.writer: BagWriter | None = None
-        self.inputs: dict[str, tuple[Qos, Any]] = {}
+        self.inputs: dict[str, _Input] = {}
         self.refused: dict[str, str] = {}
         self.early: list[tuple[float, str, bytes]] = []
         """Messages from before the first ``/clock``: (steady seconds until which it is kept, topic, CDR bytes)."""
         self.before_the_clock = 0
         self.error = ""
         self.written = self.lost = self.n_bytes = 0
+        self.last_ns: int | None = None
         self.create_service(Trigger, "recorder/start", partial(self.answer, self.begin))
         self.create_service(Trigger, "recorder/stop", partial(self.answer, self.stop))
         # Steady timers: a recording goes on while a simulated clock stands still.
@@ -120,15 +139,19 @@ class BagRecorder(GraphNode):
             BagError: the bag cannot be written.
         """
         if self.writer is None:
-            interval: Any = self.values["chunk_seconds"]
-            self.writer = BagWriter(self.folder, resume=True, flush_interval_s=interval)
-            self.error = ""
+            self.open()
+            self.error, self.last_ns = "", None
             # After a failure the subscriptions still exist, but the new file lacks their topics.
             for topic in tuple(self.inputs):
                 self.forget(topic)
-            self.get_logger().info(f"recording into {self.writer.path}")
             self.discover()
         return f"recording into {self.folder}"
+
+    def open(self) -> None:
+        """Open the folder's next file; raises BagError."""
+        interval: Any = self.values["chunk_seconds"]
+        self.writer = BagWriter(self.folder, resume=True, flush_interval_s=interval)
+        self.get_logger().info(f"recording into {self.writer.path}")
 
     def stop(self) -> str:
         """Close the bag; returns the answer to the caller.
@@ -197,7 +220,7 @@ class BagRecorder(GraphNode):
             return
         offered = tuple(from_profile(publisher.qos_profile) for publisher in publishers)
         request = request_for(offered, _DEPTH)
-        if topic in self.inputs and self.inputs[topic][0] == request:
+        if topic in self.inputs and self.inputs[topic].request == request:
             return
         self.forget(topic)
         try:
@@ -217,13 +240,12 @@ class BagRecorder(GraphNode):
 
         callback: Any = receive  # rclpy passes the message info to callbacks of two arguments
         subscription = self.create_subscription(kind, topic, callback, to_profile(request), raw=True)
-        self.inputs[topic] = (request, subscription)
+        self.inputs[topic] = _Input(type_name, offered, request, subscription)
 
     def forget(self, topic: str) -> None:
         """End a subscription."""
         if topic in self.inputs:
-            _, subscription = self.inputs.pop(topic)
-            self.destroy_subscription(subscription)
+            self.destroy_subscription(self.inputs.pop(topic).subscription)
 
     # --- messages
 
@@ -236,11 +258,13 @@ class BagRecorder(GraphNode):
             self.wait_for_clock(topic, cdr)
         else:
             self.write_early()
-            self.write(topic, cdr, self.now_ns())
+            now_ns = self.now_ns()
+            self.keep_time_forward(now_ns)
+            self.write(topic, cdr, now_ns)
 
     def wait_for_clock(self, topic: str, cdr: bytes) -> None:
         """Keep a message from before the first ``/clock``: time 0 would put it years before the rest of the bag."""
-        latched = topic in self.inputs and self.inputs[topic][0].durability == LATCHED.durability
+        latched = topic in self.inputs and self.inputs[topic].latched
         self.early.append((math.inf if latched else time.monotonic() + _EARLY_S, topic, cdr))
         self.forget_early()
 
@@ -277,6 +301,31 @@ class BagRecorder(GraphNode):
             self.fail(error)
         else:
             self.n_bytes += len(cdr)
+
+    def keep_time_forward(self, now_ns: int) -> None:
+        """Continue in a bag of its own after a jump of simulated time, such as that of a player which loops.
+
+        In one bag the messages of both rounds would stand among each other.
+        """
+        if self.writer is not None and jumped_back(now_ns, self.last_ns):
+            before = self.folder
+            rounds = (self.first.with_name(f"{self.first.name}_{number}") for number in itertools.count(2))
+            try:
+                self.written += self.writer.message_count
+                self.writer.close()
+                self.folder = next(each for each in rounds if not each.exists())
+                self.open()
+                for topic, each in tuple(self.inputs.items()):
+                    if each.latched:  # to get it once more
+                        self.forget(topic)
+                    else:
+                        self.writer.add_topic(topic, each.type_name, each.offered)
+            except BagError as error:
+                self.fail(error)
+            else:
+                self.discover()
+                self.get_logger().warning(f"time has jumped back: {before} is complete, {self.folder} goes on")
+        self.last_ns = now_ns
 
     def flush(self) -> None:
         if self.writer is not None:

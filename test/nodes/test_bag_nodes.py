@@ -188,6 +188,23 @@ def test_a_recorder_with_simulated_time_follows_the_clock(bench, tmp_path):
     assert all(stored[0][2] <= at <= stored[-1][2] for _, _, at in found)
 
 
+def test_each_round_of_a_looping_player_becomes_a_bag_of_its_own(bench, tmp_path):
+    stored = write_bag(tmp_path / "original", 300)
+    recorder = bench.start("bag_recorder", folder=tmp_path / "copy", topics=list(TOPICS), use_sim_time=True)
+    original = {"bag": tmp_path / "original", "reliable": True, "wait_for_subscribers": ALL_SUBSCRIBERS}
+    player = bench.start("bag_player", loop=True, rate=2.0, **original)
+    bench.wait_until((tmp_path / "copy_3").exists, "the third round")
+    bench.finished(player, signal.SIGINT)
+    bench.finished(recorder, signal.SIGTERM)
+    rounds = [read_bag(tmp_path / name) for name in ("copy", "copy_2")]
+    for number, found in enumerate(rounds):
+        assert [at for _, _, at in found] == sorted(at for _, _, at in found), number
+        # a message may arrive after the clock of the next round
+        assert len({cdr for _, cdr, _ in found}) > len(stored) - 10, number
+        assert any(topic == "/latched" for topic, _, _ in found), number
+    assert {cdr for found in rounds for _, cdr, _ in found} == {on_the_wire(cdr) for _, cdr, _ in stored}
+
+
 # --- playing
 
 
