@@ -365,6 +365,37 @@ def test_it_depends_neither_on_the_origin_of_world_nor_on_the_side(
     assert here.counters == there.counters
 
 
+def test_a_shoulder_that_rises_is_followed_although_its_joint_centre_is_offset() -> None:
+    """Posture tells where a clavicle is on average; how far it moves, the sensor shows. Shares of the true motion."""
+    times = np.arange(0.0, 12.0, 1.0 / 15.0)
+    raised = np.radians(12.0) * np.sin(2.0 * np.pi * 0.25 * times)
+    sides = ("LEFT", "RIGHT")
+    names = [MODEL.coordinate_names[column] for column in MODEL.scalar_v]
+    clavicles = [MODEL.scalar_q[names.index(f"clavicle_elevation_{side.lower()}")] for side in sides]
+    q = np.tile(MODEL.neutral(), (len(times), 1))
+    q[:, clavicles] = raised[:, None]
+    stated = np.broadcast_to(np.eye(3), (N_JOINTS, 3, 3)) * BASE_STDDEV[:, None, None] ** 2
+    followed = []
+    for seed in range(draws(4, 16)):
+        rng = np.random.default_rng(70 + seed)
+        points = np.full((len(times), N_JOINTS, 3), np.nan)
+        points[:, POINTS] = MODEL.linearise(q, RandomPerson.draw(rng).lengths).posture.positions
+        for side in sides:
+            points[:, [Joint[f"SHOULDER_{side}"], *ARMS[side]]] += rng.normal(scale=0.02, size=3)
+        points += rng.normal(scale=0.005, size=points.shape)
+        states = np.where(np.isfinite(points[0, :, 0]), TrackingState.TRACKED, 0).astype(np.uint8)
+        estimator = ExtendedKalmanFilter()
+        found = np.full((len(times), 2), np.nan)
+        for frame, (time, each) in enumerate(zip(times, points, strict=True)):
+            estimator.update(Skeleton(START_NS + round(time * NANOSECONDS), "world", each, states, covariances=stated))
+            if estimator.estimate is not None:
+                found[frame] = estimator.estimate.q[clavicles]
+        late = times > 4.0
+        followed += np.polyfit(raised[late], found[late], 1)[0].tolist()
+    assert 0.9 < np.median(followed) < 1.15
+    assert np.min(followed) > 0.75
+
+
 # --- two sensors
 
 

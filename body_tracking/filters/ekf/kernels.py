@@ -24,6 +24,7 @@ def upright(
     covariance: FloatArray,
     chosen: IntArray,
     variance: FloatArray,
+    mean: FloatArray,
     tree: Tree,
     table: PriorTable,
     updates: int,
@@ -36,6 +37,7 @@ def upright(
         covariance: (85, 85) of tangent, lengths and velocities.
         chosen: (k,) rows of :func:`prior_rows`.
         variance: (k,) of these rows.
+        mean: (k,) of these rows over the last time, where the prior tells of this mean; NaN where of the pose.
         tree: of the model.
         table: of the prior.
         updates: number of linearisations.
@@ -48,15 +50,20 @@ def upright(
     start, moved = q, np.zeros(size)
     pose = np.ascontiguousarray(covariance[:, :size])
     half = np.empty((count, len(covariance)))
-    for _ in range(updates):
+    aim = np.zeros(count)
+    for update in range(updates):
         _, rotations, _, _, turning = linearised(q, lengths, tree)
         _, residuals, gradients = prior_rows(q, rotations[0], turning[0], table)
+        if update == 0:
+            for k in range(count):
+                if not np.isnan(mean[k]):
+                    aim[k] = residuals[chosen[k]] - mean[k]
         rows = gradients[chosen]
         cross = np.dot(rows, pose.T)  # (k, 85)
         s = np.dot(np.ascontiguousarray(cross[:, :size]), rows.T)
         for k in range(count):
             s[k, k] += variance[k]
-        off = np.dot(rows, moved) - residuals[chosen]
+        off = np.dot(rows, moved) - residuals[chosen] + aim
         factored(s)
         half = cross
         forward_substituted(s, half)

@@ -37,6 +37,8 @@ class Output:
         self._twists = np.array([name.startswith(("shoulder_z", "forearm_pronation")) for name in names])
         self._postural = np.flatnonzero(np.append(space.prior.postural, [True] * 3))
         self._posture_variance = space.prior_table.stddev[self._postural] ** 2
+        clavicles = np.array([name.startswith("clavicle") for name in names] + [False] * 3)
+        self._followed = clavicles[self._postural]
         self._last_handed_out: tuple[State, FloatArray, FloatArray] | None = None
 
     def forget(self) -> None:
@@ -61,20 +63,29 @@ class Output:
             if self._parameters.posture:
                 free, _ = self._priors.free(state, covariance, np.empty((space.size, 0), dtype=np.float32))
                 held = covariance - free
-                q = self._upright(q, state.lengths, free)
+                q = self._upright(q, state, free)
                 covariance = free + held
             covariance[pose, pose] += np.outer(disputed, disputed) + np.outer(state.jump, state.jump)
             self._last_handed_out = state, q, covariance
         return self._last_handed_out[1:]
 
-    def _upright(self, q: FloatArray, lengths: FloatArray, covariance: FloatArray) -> FloatArray:
-        """(35,) configuration after the update by the posture prior; changes its covariance (85, 85) in place."""
+    def _upright(self, q: FloatArray, state: State, covariance: FloatArray) -> FloatArray:
+        """(35,) configuration after the update by the posture prior; changes its covariance (85, 85) in place.
+
+        An offset of a shoulder displaces its clavicle by nearly the same angle in every pose. So the prior tells how
+        far the mean of the clavicle's angles is off, and changes of the angle are kept. Applied to each pose alone it
+        would draw a raised shoulder down (docs/accuracy.md, "Shoulders that rise").
+        """
+        mean = np.full(len(self._postural), np.nan)
+        if state.mean_posture is not None:
+            mean[self._followed] = state.mean_posture[self._postural][self._followed]
         return kernels.upright(
             q,
-            lengths,
+            state.lengths,
             covariance,
             self._postural,
             self._posture_variance,
+            mean,
             self._model.tree,
             self._space.prior_table,
             _UPDATES,

@@ -137,6 +137,7 @@ class PoseSearch:
             0.0 if previous is None else previous.tracked,
             False if previous is None else previous.settled,
             SegmentLengths(self._parameters.slow_time) if previous is None else previous.seen,
+            None if previous is None else previous.mean_posture,
             np.empty((0, space.nv)),
             sources=sources,
         )

@@ -15,6 +15,8 @@ _PRIOR_PERIOD = 0.1
 
 _POSTURE_TIME = 1.0
 """Seconds: correlation time of posture; the prior counts as one observation per twice this time."""
+_MEAN_POSTURE_TIME = 60.0
+"""Seconds over which the posture is averaged."""
 VAGUE = 0.5
 """Share of the range's deviation from which an angle is moved to the middle of its range."""
 _SPURIOUS = 0.7
@@ -69,7 +71,7 @@ class Priors:
         limit = stddev**2
         unknown = variance > limit
         noise = variance * limit / np.maximum(variance - limit, 1e-12)
-        state = state.but(since_prior=0.0)
+        state = state.but(since_prior=0.0, mean_posture=_with_posture(state, values))
         if state.seen is not None and state.tracked > self._parameters.settle_time:
             state = state.but(settled=True, seen=None)
         branch = self._ranges.nearest_branch(state.q)
@@ -239,3 +241,12 @@ class Priors:
         s[np.arange(len(s)), np.arange(len(s))] += _HELD_STDDEV**2
         gain: FloatArray = np.asarray(np.linalg.solve(s, cross).T, dtype=np.float64)
         return covariance - gain @ cross, crosses - single(gain) @ (single(rows) @ crosses[t])
+
+
+def _with_posture(state: State, values: FloatArray) -> FloatArray:
+    """The state's mean posture (29,) with the present one, which counts for the time since the last."""
+    if state.mean_posture is None:
+        return values
+    share = state.since_prior / max(min(state.tracked, _MEAN_POSTURE_TIME), state.since_prior)
+    mean: FloatArray = state.mean_posture + share * (values - state.mean_posture)
+    return mean

@@ -111,6 +111,8 @@ class State(Changeable):
         tracked: seconds since the start.
         settled: the lengths are only considered.
         seen: estimator of the segment lengths; None once they are fixed.
+        mean_posture: (29,) mean of the residuals of ``prior_rows`` over the last minute; None in the first tenth of a
+            second.
         measured_at: seconds since the start at which its lengths were last applied.
         null: (k, 32) directions of the tangent that move no point.
         fresh: started from a frame, without any after it.
@@ -137,6 +139,7 @@ class State(Changeable):
     tracked: float
     settled: bool
     seen: SegmentLengths | None
+    mean_posture: FloatArray | None
     null: FloatArray
     measured_at: float = 0.0
     fresh: bool = False
