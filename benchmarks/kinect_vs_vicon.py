@@ -88,6 +88,8 @@ METHODS: Methods = {
 HELD = (DEFAULT_FILTER, "ekf")
 """Filters to which the bars apply."""
 LEAST_EXPLAINED = 0.9
+LOST_MARKER = 0.1
+"""Metres from the median height of Vicon's shoulder beyond which a marker is lost (the first frames of one clip)."""
 BARS = {"elevation": 0.80, "flexion": 0.70}
 """Largest ratio of the median RMS to the raw skeleton's."""
 WORSE = 0.5
@@ -412,7 +414,7 @@ def measure(job: tuple[Clip, ArmLaw, float, Methods]) -> dict[str, Any]:
         if name in outputs:
             figures[name]["trunk"] = outputs[name].trunk
         height = sample(at, vicon.times, vicon.height)
-        both = np.isfinite(height) & np.isfinite(arm.height)
+        both = (np.abs(height - np.nanmedian(height)) < LOST_MARKER) & np.isfinite(arm.height)
         true, found = (each[both] - each[both].mean() for each in (height, arm.height))
         figures[name]["shoulder"] = {"product": float(true @ found), "square": float(true @ true)}
         for column, angle in enumerate(ANGLES):
