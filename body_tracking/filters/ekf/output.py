@@ -37,8 +37,8 @@ class Output:
         self._twists = np.array([name.startswith(("shoulder_z", "forearm_pronation")) for name in names])
         self._postural = np.flatnonzero(np.append(space.prior.postural, [True] * 3))
         self._posture_variance = space.prior_table.stddev[self._postural] ** 2
-        clavicles = np.array([name.startswith("clavicle") for name in names] + [False] * 3)
-        self._followed = clavicles[self._postural]
+        elevations = np.array([name.startswith("clavicle_elevation") for name in names] + [False] * 3)
+        self._followed = elevations[self._postural]
         self._last_handed_out: tuple[State, FloatArray, FloatArray] | None = None
 
     def forget(self) -> None:
@@ -72,8 +72,8 @@ class Output:
     def _upright(self, q: FloatArray, state: State, covariance: FloatArray) -> FloatArray:
         """(35,) configuration after the update by the posture prior; changes its covariance (85, 85) in place.
 
-        An offset of a shoulder displaces its clavicle by nearly the same angle in every pose. So the prior tells how
-        far the mean of the clavicle's angles is off, and changes of the angle are kept. Applied to each pose alone it
+        An offset of a shoulder changes the elevation of its clavicle by nearly the same angle in every pose. So the
+        prior tells how far the mean of this elevation is off, and its changes are kept. Applied to each pose alone it
         would draw a raised shoulder down (docs/accuracy.md, "Shoulders that rise").
         """
         mean = np.full(len(self._postural), np.nan)
