@@ -55,7 +55,7 @@ class Monitor:
         Args:
             topic: its name.
             delay_ns: since the input that caused it was sent: transport and processing.
-            latency_ns: since capture, by ROS time.
+            latency_ns: since capture.
         """
         self._window[f"out {topic}"] += 1
         self.totals["published"] += 1

@@ -49,6 +49,7 @@ from body_tracking.ros.bag_topics import to_profile
 from body_tracking.ros.declare import declare
 from body_tracking.ros.executor import BatchNode
 from body_tracking.ros.monitor import Monitor
+from body_tracking.ros.ticks import Ticks
 from body_tracking.ros.wire import ROS, WIRE
 
 RCLError: type[Exception] = _rclpy.RCLError
@@ -147,6 +148,7 @@ class GraphNode(BatchNode):
         self._several_since: dict[str, float] = {}
         self.simulated = bool(self.get_parameter("use_sim_time").value)
         self._simulated_ns = 0
+        self._ticks = Ticks()
         self._rewinds = self._rewinds_logged = 0  # backward jumps of /clock
         self._rewinds_known: Counter[str] = Counter()
         self._sent_ns = 0  # wall time at which the newest handled message was sent
@@ -260,6 +262,7 @@ class GraphNode(BatchNode):
         now_ns = to_nanoseconds(clock.clock)
         self._rewinds += jumped_back(now_ns, self._simulated_ns)
         self._simulated_ns = now_ns
+        self._ticks.add(now_ns, info["source_timestamp"])
         for alarm in self._alarms:
             alarm.look()
 
@@ -457,7 +460,7 @@ class GraphNode(BatchNode):
         Args:
             publisher: of the topic.
             message: a message, or its CDR bytes.
-            stamp_ns: its capture time, for the latency.
+            stamp_ns: its capture time, for the latency: of a bag its recorded part, and the real time since.
             sent_ns: wall time at which the input that caused it was sent, for the delay.
 
         Returns:
@@ -466,12 +469,21 @@ class GraphNode(BatchNode):
         if sent_ns is not None and self.is_stale(publisher.topic_name, sent_ns):
             return False
         publisher.publish(message)
+        now_ns = time.time_ns()
         self.monitor.message_out(
             publisher.topic_name,
-            None if sent_ns is None else time.time_ns() - sent_ns,
-            None if stamp_ns is None else self.now_ns() - stamp_ns,
+            None if sent_ns is None else now_ns - sent_ns,
+            None
+            if stamp_ns is None
+            else self._since_capture_ns(stamp_ns, now_ns if sent_ns is None else sent_ns, now_ns),
         )
         return True
+
+    def _since_capture_ns(self, stamp_ns: int, sent_ns: int, now_ns: int) -> int:
+        """Time since a stamp, given the wall times at which the input was sent and now."""
+        if self.simulated:
+            return self._ticks.since_ns(stamp_ns, sent_ns, now_ns) if self._ticks else self.now_ns() - stamp_ns
+        return self.now_ns() - stamp_ns
 
     def malformed(self, topic: str, reason: str, what: str = "malformed") -> None:
         """Count and log a message that is not used."""

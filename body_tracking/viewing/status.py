@@ -13,6 +13,12 @@ FRESH: Final = 3.0
 
 _COLOURS: Final = {0: "#2f9e44", 1: "#f08c00", 2: "#e03131"}
 _NONE: Final = "&ndash;"
+_HEADS: Final = {
+    "rate": "of the output, else of the input; of a bag, per second of the bag's time",
+    "delay": "since the input was sent, median of the last second",
+    "latency": "since capture, median of the last second",
+}
+"""Heads of the columns, and what is shown while the mouse is over them."""
 _SILENT: Final = "#adb5bd"
 
 
@@ -52,7 +58,9 @@ def table(statuses: Mapping[str, NodeStatus], now: float) -> str:
             + "</tr><tr><td></td><td colspan='4' style='color:#868e96;padding-bottom:0.3em'>"
             + f"{html.escape(text)}</td></tr>"
         )
-    head = "".join(f"<td style='text-align:right'>{word}</td>" for word in ("rate", "delay", "latency"))
+    head = "".join(
+        f"<td style='text-align:right' title=\"{html.escape(text)}\">{word}</td>" for word, text in _HEADS.items()
+    )
     return (
         "<table style='width:100%;font-size:0.78em;line-height:1.25;border-spacing:0 0'>"
         f"<tr style='color:#868e96'><td></td><td>node</td>{head}</tr>{''.join(rows)}</table>"
