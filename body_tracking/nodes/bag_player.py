@@ -21,6 +21,7 @@ from body_tracking.recording.rosbag2 import BagError
 from body_tracking.ros.bag_topics import UnknownTypeError, message_class, to_profile
 from body_tracking.ros.main import run
 from body_tracking.ros.node import STEADY, GraphNode
+from body_tracking.ros.ticks import Ticks
 from body_tracking.ros.wire import ROS
 
 PARAMETERS = (
@@ -99,6 +100,7 @@ class BagPlayer(GraphNode):
             paused=given["start_paused"],
         )
         self.clock_ns = self.reader.start_ns
+        self.published = Ticks()
         self.clock_topic = None
         if given["clock_rate"]:
             depth = graph.RELIABLE_SKELETON.depth if given["reliable"] else RELIABLE.depth
@@ -121,6 +123,10 @@ class BagPlayer(GraphNode):
     def now_ns(self) -> int:
         """The bag's time if this node publishes ``/clock``; 0 before it begins."""
         return self.clock_ns if self.values["clock_rate"] else super().now_ns()
+
+    def played_ns(self) -> int | None:
+        """The bag's time that was played, if this node publishes ``/clock``."""
+        return self.published.played_ns if self.published else None
 
     # --- topics
 
@@ -187,6 +193,7 @@ class BagPlayer(GraphNode):
             self.clock_ns = batch.clock_ns
             if self.clock_topic is not None:
                 self.clock_topic.publish(Clock(clock=to_time(batch.clock_ns, ROS)))
+                self.published.add(batch.clock_ns, time.time_ns())
             for message in batch.messages:
                 self.send(self.offers[message.topic], message.cdr)
         if step.wake_ns is None:

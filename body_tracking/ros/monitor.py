@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
+from collections import Counter, deque
 
 import numpy as np
 
@@ -12,6 +12,11 @@ from body_tracking.core.skeleton import NANOSECONDS
 
 GAP_NS = 50_000_000
 """Nanoseconds between two stamps of a sensor beyond which there is a gap: at 30 Hz one frame is missing."""
+
+_WINDOW_S = 1.0
+"""Seconds of a bag's time over which rates are averaged: a second of a slow playback has few frames."""
+_SPANS = 20
+"""Largest number of reports over which they are averaged."""
 
 
 class Monitor:
@@ -27,6 +32,8 @@ class Monitor:
         self._latencies_ns: list[int] = []
         self._last_stamp: dict[str, int] = {}
         self._since = time.monotonic()
+        self._played_ns = 0
+        self._spans: deque[tuple[float, Counter[str]]] = deque(maxlen=_SPANS)
 
     def arrived(self, topic: str) -> None:
         """Count a message of an input."""
@@ -65,13 +72,14 @@ class Monitor:
         if latency_ns is not None and abs(latency_ns) < 10 * NANOSECONDS:
             self._latencies_ns.append(latency_ns)
 
-    def values(self) -> dict[str, object]:
-        """Rates since the last call, and totals."""
-        now = time.monotonic()
-        elapsed, self._since = max(now - self._since, 1e-3), now
-        values: dict[str, object] = {
-            f"rate {name}": f"{count / elapsed:.1f}" for name, count in sorted(self._window.items())
-        }
+    def values(self, played_ns: int | None = None) -> dict[str, object]:
+        """Rates since the last call, and totals.
+
+        Args:
+            played_ns: simulated time that has passed altogether, nanoseconds; rates are then per second of it. None
+                for rates per second of real time.
+        """
+        values: dict[str, object] = {f"rate {name}": f"{rate:.1f}" for name, rate in self._rates(played_ns).items()}
         self._window = Counter(dict.fromkeys(self._window, 0))
         for name, samples in (("delay", self._delays_ns), ("latency", self._latencies_ns)):
             if samples:
@@ -83,3 +91,19 @@ class Monitor:
         if self.last_reason:
             values["last malformed"] = self.last_reason
         return values
+
+    def _rates(self, played_ns: int | None) -> dict[str, float]:
+        """Rates by flow, hertz; of a bag over its last second, zero where nothing was played since the last call."""
+        now = time.monotonic()
+        elapsed, self._since = max(now - self._since, 1e-3), now
+        if played_ns is not None:
+            played, self._played_ns = (played_ns - self._played_ns) / NANOSECONDS, played_ns
+            if played > 0.0:
+                while sum(seconds for seconds, _ in list(self._spans)[1:]) + played >= _WINDOW_S and self._spans:
+                    self._spans.popleft()
+                self._spans.append((played, self._window))
+                elapsed = sum(seconds for seconds, _ in self._spans)
+                counts = sum((count for _, count in self._spans), Counter[str]())
+                return {name: counts[name] / elapsed for name in sorted(self._window)}
+            self._spans.clear()
+        return {name: count / elapsed for name, count in sorted(self._window.items())}

@@ -245,6 +245,10 @@ class GraphNode(BatchNode):
         """
         return self._simulated_ns if self.simulated else time.monotonic_ns()
 
+    def played_ns(self) -> int | None:
+        """Simulated time that has passed altogether, for rates; None before its first tick and for real time."""
+        return self._ticks.played_ns if self._ticks else None
+
     def _arrived(self, info: Mapping[str, int]) -> None:
         """Note the time of arrival of the current message, which may be well before it is handled."""
         if self.simulated:
@@ -519,7 +523,7 @@ class GraphNode(BatchNode):
         self._reported = time.monotonic()
         self._reported_subscribers = self._subscriber_counts()
         level, text, values = self.state()
-        values = {**self.monitor.values(), **self._reported_subscribers, **values}
+        values = {**self.monitor.values(self.played_ns()), **self._reported_subscribers, **values}
         values |= {f"dropped {topic}": count for topic, count in self.backlog.dropped.items()}
         values |= {f"lost {topic}": count for topic, count in self.sequences.lost.items()}
         values |= {f"left out after a standstill {topic}": n for topic, n in self.standstill.left_out.items()}

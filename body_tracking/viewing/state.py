@@ -46,15 +46,15 @@ def state_html(statuses: Mapping[str, NodeStatus], now: float, ended: bool = Fal
 
 
 def _input(there: Mapping[str, NodeStatus], sensors: Sequence[str]) -> list[str]:
-    """The played bag, and the rate of each sensor; with a bag only of the sensors in diagnostics."""
+    """The bag, and the rate of each sensor while it plays; with a bag only of the sensors in diagnostics."""
     lines = []
     if (player := there.get(PLAYER)) is not None:
         bag = Path(player.values.get("bag", "")).name
         position, duration = player.number("position s") or 0.0, player.number("duration s") or 0.0
         again = ", again and again" if player.values.get("loop") == "True" else ""
-        playing = player.text == "playing"
         words = f"<b>{html.escape(bag)}</b>, {position:.1f} of {duration:.1f} s{again}"
-        lines.append(line(GREEN if playing else ORANGE, html.escape(player.text), words))
+        colour = {"playing": GREEN, "paused": GREY, "at the end": GREY}.get(player.text, ORANGE)
+        lines.append(line(colour, html.escape(player.text), words))
     rates: dict[str, float] = {} if PLAYER in there else dict.fromkeys(sensors, 0.0)
     for status in there.values():
         for key in status.values:
@@ -63,10 +63,12 @@ def _input(there: Mapping[str, NodeStatus], sensors: Sequence[str]) -> list[str]
                 rate = status.number(key) or 0.0
                 if sensor not in ("fused", "filtered"):
                     rates[sensor] = max(rate, rates.get(sensor, 0.0))
-    if rates:
+    if rates and player is not None and player.text != "playing":
+        lines.append(line(GREY, "sensors", f"{', '.join(map(html.escape, sorted(rates)))}: {html.escape(player.text)}"))
+    elif rates:
         words = ", ".join(f"{html.escape(sensor)} {rate:.0f} Hz" for sensor, rate in sorted(rates.items()))
         silent = [html.escape(sensor) for sensor, rate in sorted(rates.items()) if not rate]
-        if silent and (player is None or player.text == "playing"):
+        if silent:
             words += f". <b>Nothing comes from {' and '.join(silent)}</b>: {_NOTHING}"
         lines.append(line(ORANGE if silent else GREEN, "sensors", words))
     return lines

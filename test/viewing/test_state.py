@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from body_tracking.messages.node_status import NodeStatus
-from body_tracking.viewing.state import state_html
+from body_tracking.viewing.state import GREY, ORANGE, state_html
 from body_tracking.viewing.status import FRESH
 
 PLAYER = {"bag": "/data/walk<1>", "position s": "3.21", "duration s": "20.0", "loop": "True"}
@@ -47,6 +47,17 @@ def test_a_sensor_that_sends_nothing_is_named() -> None:
     assert "Nothing comes from a and c</b>" in state_html(fusion, 0.0, sensors=("a", "b", "c"))
     paused = {**fusion, "bag_player": NodeStatus("bag_player: stream", 0, "paused", PLAYER)}
     assert "Nothing comes" not in state_html(paused, 0.0, sensors=("a", "b", "c"))
+
+
+def test_a_paused_bag_is_no_fault() -> None:
+    rates = {"rate in /a/skeleton": "0.0", "rate in /b/skeleton": "0.0"}
+    there = {
+        "fusion": NodeStatus("fusion: stream", 0, "OK", rates),
+        "bag_player": NodeStatus("bag_player: stream", 0, "paused", PLAYER),
+    }
+    text = state_html(there, 0.0)
+    assert "a, b: paused" in text and "0 Hz" not in text
+    assert ORANGE not in text and text.count(GREY) == 2
 
 
 def test_the_end_and_the_next_step_are_shown() -> None:
