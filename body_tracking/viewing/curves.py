@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,14 +12,27 @@ import numpy as np
 
 from body_tracking.core.clocks import jumped_back
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
-from body_tracking.kinematics.labels import UNKNOWN
+from body_tracking.kinematics.labels import OTHER, UNKNOWN, label_of, limb_of
 
 BAND: Final = 1.959963984540054
 """Half width of the 95 % band of a normal distribution, in standard deviations."""
 WIDEST: Final = 60.0
 """Limit of a band's half width, degrees, also for infinite standard deviations."""
 _HALF_TURN: Final = 180.0
-_PREFERRED: Final = ("elbow_flexion", "shoulder_elevation", "shoulder_flexion", "trunk_flexion", "p_shoulder", "elbow")
+_JOINTS: Final = {
+    "elbow": ("elbow flexion", "elbow"),
+    "shoulder": ("shoulder elevation", "shoulder abduction", "shoulder flexion", "shoulder pitch", "shoulder"),
+}
+"""The joints plotted first, and the angles of each by preference: a shoulder's abduction before its flexion, which the
+T-pose leaves undetermined."""
+_GROUPS: Final = {"elbow": "elbows", "shoulder": "shoulders", "humeral": "shoulders", "clavicle": "clavicles"}
+_LIMB_GROUPS: Final = {
+    "left arm": "arms",
+    "right arm": "arms",
+    "trunk and head": "trunk",
+    "left leg": "legs",
+    "right leg": "legs",
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,9 +153,30 @@ def extremes(series: FloatArray, count: int) -> IntArray:
 
 
 def first_choice(names: Sequence[str], count: int) -> tuple[str, ...]:
-    """The angles plotted before the user's choice: elbows and shoulders first."""
+    """The angles plotted before the user's choice: one of each elbow and of each shoulder, then others of these joints,
+    then those of the trunk, and of the clavicles last.
+    """
+    labels = {name: label_of(name) for name in names}
 
     def rank(name: str) -> int:
-        return next((place for place, word in enumerate(_PREFERRED) if word in name), len(_PREFERRED))
+        label = labels[name]
+        if any(joint in label for joint in (*_JOINTS, "humeral")):
+            return 0
+        return 1 if label == "trunk flexion" else 3 if "clavicle" in label else 2
 
-    return tuple(sorted(names, key=rank)[:count])
+    first: list[str] = []
+    for kinds in _JOINTS.values():
+        for side in ("left", "right"):
+            own = (name for kind in kinds for name in names if labels[name].startswith(f"{side} {kind}"))
+            first += itertools.islice(own, 1)
+    return (*first, *sorted((name for name in names if name not in first), key=rank))[:count]
+
+
+def heading_of(names: Sequence[str]) -> str:
+    """What these angles are of, such as ``elbows and shoulders``."""
+    groups = []
+    for name in names:
+        joints = (group for joint, group in _GROUPS.items() if joint in label_of(name))
+        groups.append(next(joints, None) or _LIMB_GROUPS.get(limb_of(name), OTHER))
+    *most, last = dict.fromkeys(groups) or ("",)
+    return f"{', '.join(most)} and {last}" if most else last

@@ -9,7 +9,7 @@ import viser
 from viser import uplot
 
 from body_tracking.kinematics.labels import by_limb, label_of
-from body_tracking.viewing.curves import AngleHistory, first_choice
+from body_tracking.viewing.curves import AngleHistory, first_choice, heading_of
 
 PLOTS: Final = 4
 """Number of plots."""
@@ -18,7 +18,6 @@ POINTS: Final = 200
 HEIGHT: Final = 92
 """Height of a plot, pixels: all plots fit a window of 720."""
 NONE: Final = "none yet"
-_USUAL: Final = "elbows and shoulders"
 
 
 class Plots:
@@ -30,7 +29,9 @@ class Plots:
     """
 
     def __init__(self, gui: viser.GuiApi, window: float) -> None:
-        self._limb: Any = gui.add_dropdown("show", (_USUAL,))
+        self._usual = NONE
+        """Heading of the first choice."""
+        self._limb: Any = gui.add_dropdown("show", (NONE,))
         self._shown = ""
         self._known: tuple[str, ...] = ()
         self._plots = [_Plot(gui, window) for _ in range(PLOTS)]
@@ -41,15 +42,16 @@ class Plots:
         # an angle that is lost stays in the lists until others come
         if not set(known) <= set(self._known) or set(self._known) - set(history.names):
             self._known = tuple(name for own in by_limb(known).values() for name in own)
-            limbs = (_USUAL, *by_limb(known))
+            before, self._usual = self._usual, heading_of(first_choice(self._known, PLOTS))
+            limbs = tuple(dict.fromkeys((self._usual, *by_limb(known))))
             if self._limb.options != limbs:
                 kept = self._limb.value
                 self._limb.options = limbs
-                self._limb.value = kept if kept in limbs else _USUAL
+                self._limb.value = kept if kept in limbs and kept != before else self._usual
             self._shown = ""
         limb = self._limb.value
         if limb != self._shown:
-            own = by_limb(self._known).get(limb) or first_choice(self._known, PLOTS)
+            own = first_choice(self._known, PLOTS) if limb == self._usual else by_limb(self._known).get(limb, ())
             for place, plot in enumerate(self._plots):
                 plot.offer(self._known, own[place] if place < len(own) else "")
             self._shown = limb

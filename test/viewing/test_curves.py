@@ -8,7 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from body_tracking.core.skeleton import NANOSECONDS
-from body_tracking.viewing.curves import BAND, WIDEST, AngleHistory, extremes, first_choice
+from body_tracking.kinematics.labels import label_of
+from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
+from body_tracking.viewing.curves import BAND, WIDEST, AngleHistory, extremes, first_choice, heading_of
 from draws import draws
 
 NAMES = ("elbow_flexion_left", "trunk_axial")
@@ -121,6 +123,33 @@ def test_elbows_come_first_where_there_are_any() -> None:
     assert first_choice(names, 2) == ("elbow_flexion_left", "elbow_flexion_right")
     assert set(first_choice(names, 9)) == set(names)
     assert first_choice((), 3) == ()
+
+
+@pytest.mark.parametrize("convention", [each for each in ALL_CONVENTIONS if each != "dh26"])
+def test_each_elbow_and_each_shoulder_has_a_plot(convention: str) -> None:
+    chosen = first_choice(angle_names(convention), 4)
+    assert heading_of(chosen) == "elbows and shoulders"
+    sides = {"left": 0, "right": 0}
+    for name in chosen:
+        sides[label_of(name).partition(" ")[0]] += 1
+    assert sides == {"left": 2, "right": 2}
+
+
+def test_in_the_t_pose_the_shoulders_show_an_angle_that_is_known() -> None:
+    unknown = ("shoulder_flexion", "shoulder_rotation", "forearm_pronation")
+    names = [name for name in angle_names("model") if not name.startswith(unknown)]
+    assert first_choice(names, 4)[2:] == ("shoulder_abduction_left", "shoulder_abduction_right")
+    one = [name for name in names if name != "shoulder_abduction_left"]
+    assert first_choice(one, 4)[2:] == ("shoulder_abduction_right", "trunk_flexion")
+    assert heading_of(first_choice(one, 4)) == "elbows, shoulders and trunk"
+    assert "clavicle" not in " ".join(first_choice(one, 12))
+
+
+def test_other_angles_are_headed_as_what_they_are() -> None:
+    assert heading_of(first_choice(angle_names("dh26"), 4)) == "trunk"
+    assert heading_of(("clavicle_protraction_left", "elbow_flexion_right")) == "clavicles and elbows"
+    assert heading_of(("speed",)) == "other angles"
+    assert heading_of(()) == ""
 
 
 def test_only_angles_with_a_value_and_a_finite_deviation_are_known() -> None:
