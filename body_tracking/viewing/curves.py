@@ -19,6 +19,8 @@ BAND: Final = 1.959963984540054
 WIDEST: Final = 60.0
 """Limit of a band's half width, degrees, also for infinite standard deviations."""
 _HALF_TURN: Final = 180.0
+_DECIMALS: Final = 3
+"""Most decimals of an angle in degrees."""
 _JOINTS: Final = {
     "elbow": ("elbow flexion", "elbow"),
     "shoulder": ("shoulder elevation", "shoulder abduction", "shoulder flexion", "shoulder pitch", "shoulder"),
@@ -54,9 +56,14 @@ class Curve:
     latest_stddev: float
 
     def latest(self) -> str:
-        """The latest angle and half its band; ``?`` where that is half a turn or more, which leaves no angle out."""
+        """The latest angle and half its band, to a tenth of a degree, or finer for a band that is narrower.
+
+        ``?`` stands for half a turn or more, which leaves no angle out.
+        """
         reach = BAND * self.latest_stddev
-        return f"{self.values[-1]:.1f}\u00b0 \u00b1 " + (f"{reach:.1f}\u00b0" if reach < _HALF_TURN else "?")
+        decimals = next((each for each in range(1, _DECIMALS) if reach >= 10.0**-each), _DECIMALS)
+        half = f"{reach:.{decimals}f}\u00b0" if reach < _HALF_TURN else "?"
+        return f"{self.values[-1]:.{decimals}f}\u00b0 \u00b1 {half}"
 
 
 class AngleHistory:

@@ -268,7 +268,7 @@ class Page:
             for name, (label, shown) in self._choices.items():
                 self._checkbox(name, label, shown)
         angles = gui.add_panel()
-        with angles.add_tab("Joint angles", viser.Icon.CHART_LINE):
+        with angles.add_tab("Joint angles \u00b1 95 %", viser.Icon.CHART_LINE):
             self._plots = Plots(gui, window)
         angles.dock_left()
         angles.set_width(WIDTH)

@@ -8,8 +8,9 @@ import numpy as np
 import viser
 from viser import uplot
 
+from body_tracking.core.skeleton import FloatArray
 from body_tracking.kinematics.labels import by_limb, label_of
-from body_tracking.viewing.curves import AngleHistory, first_choice, heading_of
+from body_tracking.viewing.curves import AngleHistory, Curve, first_choice, heading_of
 
 PLOTS: Final = 4
 """Number of plots."""
@@ -17,6 +18,11 @@ POINTS: Final = 200
 """Largest number of points of a plotted curve: about one per two pixels."""
 HEIGHT: Final = 92
 """Height of a plot, pixels: all plots fit a window of 720."""
+FONT: Final = "10px sans-serif"
+SPACE: Final = 12
+"""Least distance between two labels of the vertical axis, pixels: low enough that there are always two."""
+LEAST: Final = 2.0
+"""Smallest range of the vertical axis, degrees: of a smaller one the labels have no room for their decimals."""
 NONE: Final = "none yet"
 
 
@@ -74,18 +80,28 @@ class _Plot:
         nothing = np.zeros(2)
         hidden = uplot.Series(label="", stroke="rgba(0,0,0,0)", width=0.0, points={"show": False})
         self._plot = gui.add_uplot(
-            (empty, nothing, nothing, nothing),
+            (empty, nothing, nothing, nothing, nothing),
             (
                 uplot.Series(label="s"),
                 uplot.Series(label="deg", stroke="rgb(38,108,190)", width=1.6, points={"show": False}),
+                hidden,
                 hidden,
                 hidden,
             ),
             bands=(uplot.Band(series=(3, 2), fill="rgba(38,108,190,0.18)"),),
             scales={"x": uplot.Scale(time=False, range=(-window, 0.0)), "y": uplot.Scale(auto=True)},
             axes=(
-                uplot.Axis(size=20, label="s", labelSize=12, labelFont="10px sans-serif", labelGap=-2),
-                uplot.Axis(size=36, label="degrees", labelSize=14, labelFont="10px sans-serif"),
+                uplot.Axis(size=20, label="s", labelSize=12, labelFont=FONT, labelGap=-2),
+                uplot.Axis(
+                    size=38,
+                    label="degrees",
+                    labelSize=14,
+                    labelFont=FONT,
+                    font=FONT,
+                    space=SPACE,
+                    gap=3,
+                    ticks={"size": 4},
+                ),
             ),
             legend=uplot.Legend(show=False),
             height=HEIGHT,
@@ -104,5 +120,12 @@ class _Plot:
         """Show the chosen angle."""
         curve = history.curve(self._names.get(self._choice.value, ""), POINTS)
         if curve is not None:
-            self._plot.data = (curve.times, curve.values, curve.low, curve.high)
+            self._plot.data = (curve.times, curve.values, curve.low, curve.high, widened(curve))
             self._choice.label = curve.latest()
+
+
+def widened(curve: Curve) -> FloatArray:
+    """(n,) values of an invisible series, degrees, that gives the vertical axis its smallest range."""
+    middle = 0.5 * (curve.low.min() + curve.high.max())
+    ends: FloatArray = middle + np.linspace(-0.5, 0.5, len(curve.times)) * LEAST
+    return ends

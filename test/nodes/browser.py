@@ -185,7 +185,6 @@ def browsing(
         sharpness: pixels that are drawn per pixel of the window.
         name: of the process that serves the page.
     """
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
     def opened() -> bool:
         return (running.folder / f"{name}.log").exists() and "open http" in running.log(name)
@@ -193,6 +192,14 @@ def browsing(
     assert running.until(opened, PATIENCE), running.log(name)
     address = re.search(r"http://\S+", running.log(name))
     assert address is not None and address[0].startswith("http://127.0.0.1:")
+    with opened_page(address[0], folder, size, sharpness) as page:
+        yield page
+
+
+@contextmanager
+def opened_page(address: str, folder: Path, size: tuple[int, int], sharpness: float) -> Iterator[Any]:
+    """A page in playwright; arguments as of :func:`browsing`."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     with playwright.sync_playwright() as driver:
         # Software draws as fast as it can; what it draws comes first.
         gentle = folder / "chromium"
@@ -201,6 +208,6 @@ def browsing(
         chromium = driver.chromium.launch(executable_path=gentle, args=list(SOFTWARE), timeout=1e3 * PATIENCE)
         page = chromium.new_page(viewport={"width": size[0], "height": size[1]})
         page.set_default_timeout(1e3 * PATIENCE)
-        page.goto(f"{address[0]}/?fixedDpr={sharpness}")
+        page.goto(f"{address}/?fixedDpr={sharpness}")
         yield page
         chromium.close()

@@ -36,7 +36,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.alone]  # the browser draws in softw
 BAG = Path(__file__).resolve().parent.parent.parent / "bags" / "tpose_torso_twist"
 EVERY = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 CURVES = """() => Object.values(window.__viserTestpoints?.uplots ?? {})
-  .map(plot => plot.chart.data.map(series => Array.from(series)))"""
+  .map(plot => plot.chart.data.slice(0, 4).map(series => Array.from(series)))"""
 
 
 @pytest.fixture

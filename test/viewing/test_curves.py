@@ -78,6 +78,16 @@ def test_a_band_that_spans_all_angles_is_not_given_as_a_number() -> None:
         assert curve is not None and curve.latest() == text
 
 
+@pytest.mark.parametrize(
+    ("half", "text"), [(0.11, "17.2° ± 0.1°"), (0.03, "17.19° ± 0.03°"), (0.004, "17.189° ± 0.004°")]
+)
+def test_a_narrow_band_is_not_shown_as_zero(half: float, text: str) -> None:
+    history = filled(10)
+    history.add(10 * STEP_NS, NAMES, np.array([0.3, 0.5]), np.array([np.radians(half) / BAND, 0.01]))
+    curve = history.curve(NAMES[0], 200)
+    assert curve is not None and curve.latest() == text
+
+
 # --- kept samples
 
 
