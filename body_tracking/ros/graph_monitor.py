@@ -98,6 +98,7 @@ class GraphMonitor:
         rclpy.try_shutdown(context=self._context)
         self._thread.join(timeout=2.0)
         self._executor.shutdown()  # before Python destroys objects in any order
+        self._node.destroy_node()  # otherwise other processes still discover it
 
     def _spin(self) -> None:
         with contextlib.suppress(ExternalShutdownException):

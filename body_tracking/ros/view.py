@@ -68,7 +68,8 @@ def run(args: argparse.Namespace) -> int:
             port, choice, found = _choose(args, host, port, *said, choice)
             what = choice.bag.name if choice.bag is not None else "the graph"
             try:
-                supervisor = supervise(_graph(args, choice), found, {"viewer": {"host": host, "port": port}})
+                viewer: dict[str, Value] = {"host": host, "port": port, "start_page": True}
+                supervisor = supervise(_graph(args, choice), found, {"viewer": viewer})
             except BodyTrackingError as error:
                 said = str(error), "failed"
                 continue

@@ -79,6 +79,7 @@ class Page:
         window: seconds that the plots show.
         layers: further layers of the scene, of other systems.
         views: of other systems, from several topics.
+        start_page: the start page is back at this address once the graph has ended.
 
     Attributes:
         visible: which layers are switched on, by name.
@@ -98,6 +99,7 @@ class Page:
         window: float,
         layers: Sequence[Layer] = (),
         views: Sequence[SystemView] = (),
+        start_page: bool = False,
     ) -> None:
         self._server = serve(host, port)
         self._controls = controls
@@ -109,7 +111,7 @@ class Page:
         self._floor: float | None = None
         self._target = _INITIAL_TARGET
         self._scene(sensors)
-        self._panels(filters, conventions, window)
+        self._panels(filters, conventions, window, start_page)
         for view in views:
             view.start(self._server)
         self._server.on_client_connect(self._look_at_person)
@@ -256,11 +258,12 @@ class Page:
 
     # --- panels
 
-    def _panels(self, filters: Sequence[str], conventions: Sequence[str], window: float) -> None:
+    def _panels(self, filters: Sequence[str], conventions: Sequence[str], window: float, start_page: bool) -> None:
         gui = self._server.gui
         gui.main_panel.dock_right()
         gui.main_panel.set_width(WIDTH)
-        self._panel = ControlPanel(self._server, self._controls, filters, conventions, tuple(self._colours))
+        sensors = tuple(self._colours)
+        self._panel = ControlPanel(self._server, self._controls, filters, conventions, sensors, start_page)
         self._legend = gui.add_html(self._legend_text())
         with gui.add_folder("Nodes"):
             self._table = gui.add_html("no diagnostics yet")

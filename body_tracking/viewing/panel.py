@@ -38,6 +38,7 @@ class ControlPanel:
         filters: options.
         conventions: options.
         sensors: names of the sensors of skeletons.
+        start_page: the start page is back at this address once the graph has ended.
     """
 
     def __init__(
@@ -47,8 +48,10 @@ class ControlPanel:
         filters: Sequence[str],
         conventions: Sequence[str],
         sensors: Sequence[str] = (),
+        start_page: bool = False,
     ) -> None:
         self._server, self._controls, self._sensors = server, controls, tuple(sensors)
+        self._start_page = start_page
         gui = server.gui
         self._state = gui.add_html(state_html({}, 0.0))
         self._groups: dict[str, list[Any]] = {}
@@ -72,7 +75,7 @@ class ControlPanel:
 
     def draw(self, statuses: Mapping[str, NodeStatus], now: float, ended: bool) -> None:
         """Show the state of the graph, the controls of its nodes and the current choices."""
-        self._state.content = state_html(statuses, now, ended, self._sensors)
+        self._state.content = state_html(statuses, now, ended, self._sensors, self._start_page)
         show(self._end, not ended and self._controls.offers(END))
         there = {} if ended else fresh(statuses, now)
         for node, controls in self._groups.items():

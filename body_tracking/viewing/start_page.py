@@ -15,6 +15,7 @@ from body_tracking.viewing.state import GREEN, GREY, ORANGE, RED, block, line
 
 DEFAULT: Final = "default"
 """Choice of the graph's default filter."""
+_RUNS: Final = "A graph of <code>body_tracking up</code> runs already; end it before you start another one here."
 _LEFT, _RIGHT = 540, 380
 """Widths of the panels, pixels: both fit a tablet of 1024."""
 
@@ -82,6 +83,7 @@ class StartPage:
         gui.main_panel.dock_right()
         gui.main_panel.set_width(_RIGHT)
         self._state = gui.add_html("")
+        self._said, self._ready, self._runs = "", False, False
         self.say("Choose a recording on the left, or start with sensors.", GREEN)
         with gui.add_folder("Sensors"):
             self._sensors = gui.add_html("")
@@ -121,9 +123,15 @@ class StartPage:
         return int(self._server.get_port())
 
     def say(self, text: str, colour: str) -> None:
-        """Show a line at the top."""
+        """Show a line at the top; one that says ready is hidden while another graph runs."""
         word = {RED: "failed", GREEN: "ready", ORANGE: "wait"}.get(colour, "")
-        self._state.content = block([line(colour, word, html.escape(text))])
+        self._ready = colour == GREEN
+        self._said = line(colour, word, html.escape(text))
+        self._show_state()
+
+    def _show_state(self) -> None:
+        lines = [line(ORANGE, "wait", _RUNS)] if self._runs else []
+        self._set(self._state, block(lines if self._runs and self._ready else [self._said, *lines]))
 
     def draw_recordings(self, recordings: Sequence[Recording]) -> None:
         """Show the recordings, those that can be played with a button."""
@@ -162,10 +170,9 @@ class StartPage:
         self._set(self._sensors, block([words]))
         if self._start.visible != bool(sensors and not runs):
             self._start.visible = bool(sensors and not runs)
+        self._runs = runs
+        self._show_state()
         lines = [html.escape(name) for name in nodes] or ["none"]
-        if runs:
-            text = "a graph of <code>body_tracking up</code> runs already; end it before you start another one here"
-            lines.insert(0, line(ORANGE, "runs", text))
         self._set(self._nodes, block([f"<div>{each}</div>" for each in lines]))
 
     @staticmethod

@@ -16,6 +16,10 @@ _ENDED: Final = (
     "The graph has ended; nothing here answers any more. Start it again, and this page comes back by itself: "
     "<code>body_tracking up --viewer</code>, or with <code>--bag BAG</code> to play a recording."
 )
+_RETURNS: Final = (
+    "The graph has ended; the list of recordings comes back here in some seconds. If it does not, "
+    "<code>body_tracking view</code> has ended too: start it again."
+)
 
 _NOTHING: Final = (
     "look at its cable and its program, and whether it publishes in this ROS domain (<code>body_tracking doctor</code>)"
@@ -27,7 +31,13 @@ def fresh(statuses: Mapping[str, NodeStatus], now: float) -> dict[str, NodeStatu
     return {name: status for name, status in statuses.items() if now - status.received <= FRESH}
 
 
-def state_html(statuses: Mapping[str, NodeStatus], now: float, ended: bool = False, sensors: Sequence[str] = ()) -> str:
+def state_html(
+    statuses: Mapping[str, NodeStatus],
+    now: float,
+    ended: bool = False,
+    sensors: Sequence[str] = (),
+    start_page: bool = False,
+) -> str:
     """The state as HTML.
 
     Args:
@@ -35,10 +45,11 @@ def state_html(statuses: Mapping[str, NodeStatus], now: float, ended: bool = Fal
         now: steady time, seconds.
         ended: the graph has ended.
         sensors: names of the sensors of skeletons.
+        start_page: the start page is back at this address once the graph has ended.
     """
     there = {} if ended else fresh(statuses, now)
     if ended or (statuses and not there):
-        return block([line(RED, "ended", _ENDED)])
+        return block([line(GREY, "ended", _RETURNS) if start_page else line(RED, "ended", _ENDED)])
     if not there:
         return block([line(ORANGE, "waiting", "no node has reported yet")])
     lines = [*_input(there, sensors), _calibration(there), _recording(there)]

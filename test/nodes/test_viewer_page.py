@@ -151,6 +151,7 @@ def test_a_browser_shows_the_graph_and_its_buttons_work(browser: Browser, tmp_pa
     assert stop(running.processes.pop("viewer")) == 0
     browser.until(lambda: "The graph has ended" in page.inner_text("body"), "the end in words")
     assert not page.get_by_role("button", name="calibrate", exact=True).count()
+    browser.save("viewer_ended.png", 130)
 
 
 def _spin(executor: SingleThreadedExecutor) -> None:

@@ -9,6 +9,7 @@ import pytest
 pytest.importorskip("viser", reason="viser is not installed")
 
 from body_tracking.viewing.start_page import DEFAULT, Choice, StartPage
+from body_tracking.viewing.state import GREEN, RED
 
 FILTERS = ("lkf_constant_velocity", "ekf")
 
@@ -19,3 +20,16 @@ def test_loop_and_filter_are_offered_again(before: Choice | None) -> None:
     with StartPage("127.0.0.1", 18080, FILTERS, lambda choice: None, before) as page:
         found = page._choice(None)
     assert found == Choice(None, before is not None and before.loop, DEFAULT if before is None else before.filter)
+
+
+def test_the_page_is_not_ready_while_another_graph_runs() -> None:
+    with StartPage("127.0.0.1", 18080, FILTERS, lambda choice: None) as page:
+        page.say("wave has ended; choose anew.", GREEN)
+        page.draw_domain("", ("/fusion",), True, "none")
+        assert "runs already" in page._state.content and ">ready<" not in page._state.content
+        assert "runs already" not in page._nodes.content
+        page.say("cannot be read", RED)
+        assert "cannot be read" in page._state.content and "runs already" in page._state.content
+        page.say("wave has ended; choose anew.", GREEN)
+        page.draw_domain("", (), False, "none")
+        assert "wave has ended" in page._state.content

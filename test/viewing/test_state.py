@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from body_tracking.messages.node_status import NodeStatus
-from body_tracking.viewing.state import GREY, ORANGE, state_html
+from body_tracking.viewing.state import GREY, ORANGE, RED, state_html
 from body_tracking.viewing.status import FRESH
 
 PLAYER = {"bag": "/data/walk<1>", "position s": "3.21", "duration s": "20.0", "loop": "True"}
@@ -65,4 +65,6 @@ def test_the_end_and_the_next_step_are_shown() -> None:
     assert "has ended" not in state_html(running, 10.5)
     assert "has ended" in state_html(running, 10.5, ended=True)
     assert "body_tracking up --viewer" in state_html(running, 11.0 + FRESH)  # all nodes are silent
+    assert "list of recordings comes back" in (text := state_html(running, 10.5, ended=True, start_page=True))
+    assert RED not in text and "--viewer" not in text
     assert "no node has reported yet" in state_html({}, 0.0)
