@@ -230,7 +230,8 @@ def test_invalid_bag_or_bag_without_skeletons_is_refused(capsys: pytest.CaptureF
     assert "no topic /<sensor>/skeleton; it has /fused/skeleton" in refusal(capsys, "--bag", tmp_path / "other")
     reported = refusal(capsys, "--bag", BAG.with_name("markers_arm"))
     assert reported.endswith(
-        "; give up or replay the option that takes them: --camera, --camera-rig, --depth or --marker-setup"
+        "; add to the command the option that takes them: "
+        "--camera SENSOR, --camera-rig FOLDER, --depth SENSOR or --marker-setup FOLDER"
     )
     assert "no topic /kinect7/skeleton; its sensors are kinect1, kinect2" in refusal(
         capsys, "--bag", BAG, "--sensors", "kinect1,kinect7"

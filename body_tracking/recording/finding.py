@@ -12,6 +12,7 @@ import body_tracking
 from body_tracking.core.message_types import COMPRESSED_IMAGE, IMAGE, IMU, POINT_CLOUD
 from body_tracking.core.parameters import Value
 from body_tracking.markers import setup
+from body_tracking.systems import OPTIONS
 
 SETUPS: Final[Mapping[str, Mapping[str, Value]]] = {
     "cameras_turning": {"camera_rig": "config/camera_rig", "compressed": "colour"},
@@ -21,6 +22,7 @@ SETUPS: Final[Mapping[str, Mapping[str, Value]]] = {
 """Options of ``up`` for those shipped recordings whose topics do not determine them."""
 
 _CAMERAS: Final = ("--camera", "--camera-rig", "--depth", "--marker-setup")
+_BALLS: Final = "/balls"
 _BY_TYPE: Final[Mapping[str, tuple[str, ...]]] = {
     IMAGE: _CAMERAS,
     COMPRESSED_IMAGE: _CAMERAS,
@@ -30,23 +32,28 @@ _BY_TYPE: Final[Mapping[str, tuple[str, ...]]] = {
 
 def options_for_topic(name: str, type_name: str) -> tuple[str, ...]:
     """The options of ``up`` and ``replay`` that take a topic that is no skeleton; none if nothing takes it."""
-    if type_name == POINT_CLOUD and name.endswith((setup.POINTS, "/balls")):
+    if type_name == POINT_CLOUD and name.endswith((setup.POINTS, _BALLS)):
         return ("--marker-setup",)
     return _BY_TYPE.get(type_name, ())
 
 
-def advice_for(topics: Mapping[str, str]) -> str:
-    """What to give for a recording of these topics without skeletons; empty if nothing takes them.
+def advice_for(topics: Mapping[str, str], command: str = "the command") -> str:
+    """The option to add for a recording of these topics without skeletons; empty if nothing takes them.
 
     Args:
         topics: type by name.
+        command: to which it is added.
     """
     found = {name: options_for_topic(name, type_name) for name, type_name in topics.items()}
+    for camera in (name.removesuffix(_BALLS) for name in topics if name.endswith(_BALLS)):
+        # its images are of the infrared camera that sees the balls
+        found |= {name: ("--marker-setup",) for name, taken in found.items() if taken and name.startswith(f"{camera}/")}
     options = sorted(set(chain.from_iterable(found.values())))
     if not options:
         return ""
     page = " (docs/markers.md says how to make a setup)" if ("--marker-setup",) in found.values() else ""
-    return f"give up or replay the option that takes them: {listed(options, 'or')}{page}"
+    flags = [f"{option} {OPTIONS[option.removeprefix('--').replace('-', '_')].metavar}" for option in options]
+    return f"add to {command} the option that takes them: {listed(flags, 'or')}{page}"
 
 
 def listed(names: Sequence[str], last: str = "and") -> str:

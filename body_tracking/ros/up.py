@@ -100,6 +100,10 @@ class UpError(BodyTrackingError):
     """The graph cannot be started with these options."""
 
 
+class NoSourceError(UpError):
+    """Raised when the options take nothing from a recording."""
+
+
 # --- options and parameters
 
 
@@ -152,7 +156,7 @@ def options_for(args: argparse.Namespace, found: Mapping[str, Value] = MappingPr
         if not options["played"]:
             advice = advice_for(types)
             what = f"no topic /<sensor>/skeleton; it has {', '.join(sorted(topics)) or 'none'}"
-            raise UpError(f"{args.bag}: {what}{f'; {advice}' if advice else ''}")
+            raise NoSourceError(f"{args.bag}: {what}{f'; {advice}' if advice else ''}")
     return options
 
 
