@@ -77,7 +77,7 @@ class Output:
         would draw a raised shoulder down (docs/accuracy.md, "Shoulders that rise").
         """
         mean = np.full(len(self._postural), np.nan)
-        if state.mean_posture is not None:
+        if state.mean_posture is not None and state.sensors:  # orientations alone do not show a clavicle's motion
             mean[self._followed] = state.mean_posture[self._postural][self._followed]
         return kernels.upright(
             q,
