@@ -39,15 +39,15 @@ def written(folder: Path, topics: dict[str, str]) -> Path:
 
 def test_other_sensors_of_a_recording_are_named() -> None:
     content = described(BAGS / "five_systems").content
-    assert "sensors kinect1, kinect2; also in it, unused: " in content
-    for each in ("IMUs forearm_left", "marker points of left, right", "colour images of camera1", "depth images of"):
+    assert "sensors kinect1, kinect2; also in it, for " in content
+    for each in ("--imus: forearm_left", "--marker-setup: left, right", "--marker-setup: camera1, kinect1"):
         assert each in content
     assert described(BAGS / "tpose_wave").content == "15.4 s, sensors kinect1, kinect2"
 
 
 def test_a_recording_without_skeletons_says_which_option_to_add(tmp_path: Path) -> None:
     found = described(written(tmp_path / "markers", {"/left/balls": POINT_CLOUD, "/markers/points": POINT_CLOUD}))
-    assert found.content == "0.0 s, marker points of left"
+    assert found.content == "0.0 s"
     assert "add to body_tracking view the option that takes them: --marker-setup FOLDER" in found.refusal
     assert "give up" not in found.refusal
 

@@ -97,10 +97,13 @@ class BagRecorder(GraphNode):
     NAME = "bag_recorder"
     PARAMETERS = PARAMETERS
 
+    last_ns: int | None
+    """Simulated time of the last message."""
+
     def configure(self, values: Mapping[str, Value]) -> None:
         given: dict[str, Any] = dict(values)
         self.folder = Path(given["folder"] or f"body_tracking_{datetime.now():%Y_%m_%d-%H_%M_%S}").expanduser()
-        self.first = self.folder
+        self.first, self.last_ns = self.folder, None
         self.chosen = frozenset(map(self.resolve_topic_name, given["topics"]))
         self.exclude = frozenset(map(self.resolve_topic_name, given["exclude"]))
         self.model_covariance = bool(given["model_covariance"])
@@ -121,7 +124,6 @@ class BagRecorder(GraphNode):
         self.before_the_clock = 0
         self.error = ""
         self.written = self.lost = self.n_bytes = 0
-        self.last_ns: int | None = None
         self.create_service(Trigger, "recorder/start", partial(self.answer, self.begin))
         self.create_service(Trigger, "recorder/stop", partial(self.answer, self.stop))
         # Steady timers: a recording goes on while a simulated clock stands still.
@@ -139,16 +141,28 @@ class BagRecorder(GraphNode):
             BagError: the bag cannot be written.
         """
         if self.writer is None:
-            self.open()
-            self.error, self.last_ns = "", None
+            self.open(self.now_ns() if self.simulated else None)
+            self.error = ""
             # After a failure the subscriptions still exist, but the new file lacks their topics.
             for topic in tuple(self.inputs):
                 self.forget(topic)
             self.discover()
         return f"recording into {self.folder}"
 
-    def open(self) -> None:
-        """Open the folder's next file; raises BagError."""
+    def open(self, now_ns: int | None) -> None:
+        """Open the folder's next file, or another folder's where simulated time (None without) has jumped back.
+
+        In one bag the messages of both rounds of a player that loops would be mixed.
+
+        Raises:
+            BagError: the file cannot be written.
+        """
+        if now_ns is not None and jumped_back(now_ns, self.last_ns):
+            before, self.written = self.folder, 0
+            rounds = (self.first.with_name(f"{self.first.name}_{number}") for number in itertools.count(2))
+            self.folder = next(each for each in rounds if not each.exists())
+            self.get_logger().warning(f"time has jumped back: {before} is complete, {self.folder} goes on")
+        self.last_ns = now_ns
         interval: Any = self.values["chunk_seconds"]
         self.writer = BagWriter(self.folder, resume=True, flush_interval_s=interval)
         self.get_logger().info(f"recording into {self.writer.path}")
@@ -303,18 +317,11 @@ class BagRecorder(GraphNode):
             self.n_bytes += len(cdr)
 
     def keep_time_forward(self, now_ns: int) -> None:
-        """Continue in a bag of its own after a jump of simulated time, such as that of a player which loops.
-
-        In one bag the messages of both rounds would stand among each other.
-        """
+        """Continue in another folder after a backward jump of simulated time."""
         if self.writer is not None and jumped_back(now_ns, self.last_ns):
-            before = self.folder
-            rounds = (self.first.with_name(f"{self.first.name}_{number}") for number in itertools.count(2))
             try:
-                self.written += self.writer.message_count
                 self.writer.close()
-                self.folder = next(each for each in rounds if not each.exists())
-                self.open()
+                self.open(now_ns)
                 for topic, each in tuple(self.inputs.items()):
                     if each.latched:  # to get it once more
                         self.forget(topic)
@@ -322,9 +329,7 @@ class BagRecorder(GraphNode):
                         self.writer.add_topic(topic, each.type_name, each.offered)
             except BagError as error:
                 self.fail(error)
-            else:
-                self.discover()
-                self.get_logger().warning(f"time has jumped back: {before} is complete, {self.folder} goes on")
+            self.discover()
         self.last_ns = now_ns
 
     def flush(self) -> None:

@@ -12,6 +12,7 @@ import body_tracking
 from body_tracking.core.message_types import COMPRESSED_IMAGE, IMAGE, IMU, POINT_CLOUD
 from body_tracking.core.parameters import Value
 from body_tracking.markers import setup
+from body_tracking.pipeline.system import Option
 from body_tracking.systems import OPTIONS
 
 SETUPS: Final[Mapping[str, Mapping[str, Value]]] = {
@@ -23,6 +24,8 @@ SETUPS: Final[Mapping[str, Mapping[str, Value]]] = {
 
 _CAMERAS: Final = ("--camera", "--camera-rig", "--depth", "--marker-setup")
 _BALLS: Final = "/balls"
+_ESTIMATED: Final = "/imu/"
+"""Topics of orientations that the graph estimates, of the same type as those of sensors."""
 _BY_TYPE: Final[Mapping[str, tuple[str, ...]]] = {
     IMAGE: _CAMERAS,
     COMPRESSED_IMAGE: _CAMERAS,
@@ -34,7 +37,19 @@ def options_for_topic(name: str, type_name: str) -> tuple[str, ...]:
     """The options of ``up`` and ``replay`` that take a topic that is no skeleton; none if nothing takes it."""
     if type_name == POINT_CLOUD and name.endswith((setup.POINTS, _BALLS)):
         return ("--marker-setup",)
+    if name.startswith(_ESTIMATED):
+        return ()
     return _BY_TYPE.get(type_name, ())
+
+
+def _takers(topics: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
+    """The options that take each topic that is no skeleton, given the topics' types."""
+    found = {name: options_for_topic(name, type_name) for name, type_name in topics.items()}
+    found = {name: options for name, options in found.items() if options}
+    for camera in (name.removesuffix(_BALLS) for name in topics if name.endswith(_BALLS)):
+        # its images are of the infrared camera that sees the balls
+        found |= {name: ("--marker-setup",) for name in found if name.startswith(f"{camera}/")}
+    return found
 
 
 def advice_for(topics: Mapping[str, str], command: str = "the command") -> str:
@@ -44,16 +59,35 @@ def advice_for(topics: Mapping[str, str], command: str = "the command") -> str:
         topics: type by name.
         command: to which it is added.
     """
-    found = {name: options_for_topic(name, type_name) for name, type_name in topics.items()}
-    for camera in (name.removesuffix(_BALLS) for name in topics if name.endswith(_BALLS)):
-        # its images are of the infrared camera that sees the balls
-        found |= {name: ("--marker-setup",) for name, taken in found.items() if taken and name.startswith(f"{camera}/")}
+    found = _takers(topics)
     options = sorted(set(chain.from_iterable(found.values())))
     if not options:
         return ""
     page = " (docs/markers.md says how to make a setup)" if ("--marker-setup",) in found.values() else ""
-    flags = [f"{option} {OPTIONS[option.removeprefix('--').replace('-', '_')].metavar}" for option in options]
+    flags = [f"{option} {_option(option).metavar}" for option in options]
     return f"add to {command} the option that takes them: {listed(flags, 'or')}{page}"
+
+
+def unused(topics: Mapping[str, str], options: Mapping[str, Value]) -> str:
+    """The sources in a recording that a graph leaves out, after the options that take them; empty if there are none.
+
+    Args:
+        topics: type by name.
+        options: of the graph.
+    """
+    left: dict[tuple[str, ...], set[str]] = {}
+    for topic, takers in _takers(topics).items():
+        source = topic.split("/")[1]
+        given = [options.get(_option(each).name) for each in takers]
+        # a folder takes all of its kind, names take what they name, as in SEGMENT:NAME
+        taken = {part for each in given if isinstance(each, tuple) for name in each for part in name.split(":")}
+        if source not in taken and not any(each for each in given if isinstance(each, str)):
+            left.setdefault(takers, set()).add(source)
+    return "; ".join(f"{listed(takers, 'or')}: {', '.join(sorted(names))}" for takers, names in left.items())
+
+
+def _option(flag: str) -> Option:
+    return OPTIONS[flag.removeprefix("--").replace("-", "_")]
 
 
 def listed(names: Sequence[str], last: str = "and") -> str:

@@ -22,8 +22,7 @@ from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.node_parameters import parameters_for
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.system import NodeSpec
-from body_tracking.recording.content import content_of, in_words
-from body_tracking.recording.finding import advice_for, bags_in, listed, shipped_bags, shipped_setup
+from body_tracking.recording.finding import advice_for, bags_in, listed, shipped_bags, shipped_setup, unused
 from body_tracking.recording.rig import RigReader
 from body_tracking.ros import dds
 from body_tracking.ros.up import NoSourceError, UpError, flags, has_sensors, no_ros, options_for, supervise
@@ -179,23 +178,23 @@ def _described(args: argparse.Namespace, bag: Path, where: str) -> Any:
             length = f"{(reader.end_ns - reader.start_ns) / NANOSECONDS:.1f} s"
     except BodyTrackingError as error:
         return Recording(bag, where, "cannot be read", str(error).replace(f"{bag}/", ""))
-    content = content_of(types)
-    if content.bodies:
-        length += f", results (angles of {listed(content.bodies)})"
+    bodies = graph.bodies_among(types)
+    if bodies:
+        length += f", results (angles of {listed(bodies)})"
     try:
         options = options_for(_graph(args, Choice(bag, False, DEFAULT)))
     except NoSourceError as error:
         if advice := advice_for(types, "body_tracking view"):
-            return Recording(bag, where, f"{length}, {in_words(content.sources)}", f"To play it, {advice}")
-        if content.bodies:
+            return Recording(bag, where, length, f"To play it, {advice}")
+        if bodies:
             return Recording(bag, where, length, "No sensors to play: body_tracking show draws the angles")
         return Recording(bag, where, length, str(error).removeprefix(f"{bag}: "))
     except BodyTrackingError as error:
         return Recording(bag, where, length, str(error).removeprefix(f"{bag}: "))
     sources = {name: options[name] for name, each in OPTIONS.items() if each.source and options[name]}
     skeletons = {"sensors": options["sensors"]} if options["sensors"] and not options["computed"] else {}
-    others = in_words(content.without(options))
-    also = f"; also in it, unused: {others}" if others else ""
+    others = unused(types, options)
+    also = f"; also in it, for {others}" if others else ""
     return Recording(bag, where, f"{length}, {_in_words({**skeletons, **sources})}{also}")
 
 

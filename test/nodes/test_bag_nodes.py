@@ -205,6 +205,19 @@ def test_each_round_of_a_looping_player_becomes_a_bag_of_its_own(bench, tmp_path
     assert {cdr for found in rounds for _, cdr, _ in found} == {on_the_wire(cdr) for _, cdr, _ in stored}
 
 
+def test_a_recording_that_is_continued_in_a_later_round_has_a_bag_of_its_own(bench, tmp_path):
+    write_bag(tmp_path / "original", 300)
+    clock = bench.collect(Clock, "/clock")
+    recorder = bench.start("bag_recorder", folder=tmp_path / "copy", topics=list(TOPICS), use_sim_time=True)
+    player = bench.start("bag_player", bag=tmp_path / "original", loop=True, wait_for_subscribers=ALL_SUBSCRIBERS)
+    bench.wait_until(lambda: clock and to_nanoseconds(clock[-1].clock) > START_NS + 200 * STEP_NS, "most of a round")
+    assert bench.trigger("/recorder/stop").message.endswith("/copy")
+    bench.wait_until(lambda: to_nanoseconds(clock[-1].clock) < START_NS + 50 * STEP_NS, "the next round")
+    assert bench.trigger("/recorder/start").message.endswith("/copy_2")
+    bench.finished(player, signal.SIGINT)
+    bench.finished(recorder, signal.SIGTERM)
+
+
 # --- playing
 
 
