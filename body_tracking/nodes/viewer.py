@@ -62,7 +62,7 @@ PARAMETERS = (
     ),
     Parameter("plot_rate", 4.0, "draw the curves of joint angles at most this often", unit="Hz", min=0.1, max=30.0),
     Parameter("window", 15.0, "how much of the joint angles is shown", unit="s", min=1.0, max=120.0),
-    Parameter("start_page", False, "body_tracking view sets it: its list is back at this address at the graph's end"),
+    Parameter("start_page", False, "set by body_tracking view: its list of recordings returns when the graph ends"),
     SENSORS,
     BODY,
     *(

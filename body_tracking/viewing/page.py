@@ -79,7 +79,7 @@ class Page:
         window: seconds that the plots show.
         layers: further layers of the scene, of other systems.
         views: of other systems, from several topics.
-        start_page: the start page is back at this address once the graph has ended.
+        start_page: whether the start page returns at this address when the graph ends.
 
     Attributes:
         visible: which layers are switched on, by name.

@@ -38,7 +38,7 @@ class ControlPanel:
         filters: options.
         conventions: options.
         sensors: names of the sensors of skeletons.
-        start_page: the start page is back at this address once the graph has ended.
+        start_page: whether the start page returns at this address when the graph ends.
     """
 
     def __init__(

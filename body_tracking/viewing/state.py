@@ -45,7 +45,7 @@ def state_html(
         now: steady time, seconds.
         ended: the graph has ended.
         sensors: names of the sensors of skeletons.
-        start_page: the start page is back at this address once the graph has ended.
+        start_page: whether the start page returns at this address when the graph ends.
     """
     there = {} if ended else fresh(statuses, now)
     if ended or (statuses and not there):

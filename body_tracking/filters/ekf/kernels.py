@@ -37,7 +37,8 @@ def upright(
         covariance: (85, 85) of tangent, lengths and velocities.
         chosen: (k,) rows of :func:`prior_rows`.
         variance: (k,) of these rows.
-        mean: (k,) of these rows over the last time, where the prior tells of this mean; NaN where of the pose.
+        mean: (k,) mean residual of each row over the last minute, where the prior applies to that mean; NaN where it
+            applies to the present pose.
         tree: of the model.
         table: of the prior.
         updates: number of linearisations.

@@ -73,8 +73,8 @@ class Output:
         """(35,) configuration after the update by the posture prior; changes its covariance (85, 85) in place.
 
         An offset of a shoulder changes the elevation of its clavicle by nearly the same angle in every pose. So the
-        prior tells how far the mean of this elevation is off, and its changes are kept. Applied to each pose alone it
-        would draw a raised shoulder down (docs/accuracy.md, "Shoulders that rise").
+        prior corrects the mean of this elevation, and the filter keeps the changes. A prior of each pose alone would
+        draw a raised shoulder down (docs/accuracy.md, "Shoulders that rise").
         """
         mean = np.full(len(self._postural), np.nan)
         if state.mean_posture is not None and state.sensors:  # orientations alone do not show a clavicle's motion

@@ -244,7 +244,7 @@ class Priors:
 
 
 def _with_posture(state: State, values: FloatArray) -> FloatArray:
-    """The state's mean posture (29,) with the present one, which counts for the time since the last."""
+    """The state's mean posture (29,), updated by the present posture with the weight of the time since the last one."""
     if state.mean_posture is None:
         return values
     share = state.since_prior / max(min(state.tracked, _MEAN_POSTURE_TIME), state.since_prior)
