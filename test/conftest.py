@@ -96,6 +96,7 @@ class SharedNodes(LoadScopeScheduling):
         return file if 'scope="module"' in (ROOT / file).read_text(encoding="utf-8") else nodeid
 
 
+@pytest.hookimpl(optionalhook=True)  # without xdist, nobody asks
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> SharedNodes | None:
     """For ``--dist loadscope``."""
     return SharedNodes(config, log) if config.getvalue("dist") == "loadscope" else None

@@ -43,7 +43,11 @@ class MeshView:
     """
 
     body = ""
-    layers: Mapping[str, tuple[str, bool]] = {_IMAGES: ("depth images", True), _MESH: ("mesh", True)}
+    layers: Mapping[str, tuple[str, bool]] = {
+        _IMAGES: ("depth images", True),
+        _MESH: ("mesh", True),
+        "body": ("body", False),  # the page's own, of capsules, would cover the mesh
+    }
 
     def __init__(self, cameras: Sequence[str], clock: Callable[[], float] = time.monotonic) -> None:
         self._cameras = tuple(check_sensor_name(each) for each in cameras)

@@ -53,7 +53,7 @@ class SystemView(Protocol):
     """A system's part of the page, from several topics; :class:`~body_tracking.pipeline.system.View` names its class.
 
     Attributes:
-        layers: label and initial visibility of each layer, by name.
+        layers: label and initial visibility of each layer, by name; of the page's own, too, where these get in the way.
         body: the person whose angles are shown without sensors of skeletons; empty for none.
         held: topics whose last message is valid until the next one, at any age, such as calibrations of cameras.
     """

@@ -1,7 +1,4 @@
-"""The marker system in a real browser: points, targets and the cameras' images are those of the messages.
-
-With ``BODY_TRACKING_SCREENSHOTS=docs/images`` it writes the picture of the documentation there.
-"""
+"""The marker system in a real browser: points, targets and the cameras' images are those of the messages."""
 
 from __future__ import annotations
 
@@ -16,7 +13,7 @@ rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 pytest.importorskip("viser", reason="viser is not installed")
 
-from browser import PATIENCE, PICTURES, Browser, browsing, need_chromium, pixels_where  # noqa: E402
+from browser import PATIENCE, Browser, browsing, need_chromium, pixels_where  # noqa: E402
 from running import RELIABLE, ROOT, Running  # noqa: E402
 
 from body_tracking.core.parameters import check_all  # noqa: E402
@@ -40,7 +37,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.alone]  # the browser draws in softw
 
 BAG, LAB = ROOT / "bags" / "markers_arm", ROOT / "config" / "marker_setup"
 STAGES = (DetectorStage, TriangulationStage, TrackerStage, AnglesOfTargetsStage)
-PAIRS = 60 if PICTURES else 5
+PAIRS = 5
 SHOWN = """name => window.__viserSceneTree?.getState()[name]?.effectiveVisibility"""
 LINES = """() => {
   const points = window.__viserSceneTree?.getState()["/markers/chain/lines"]?.message.props.points;
@@ -79,9 +76,8 @@ def test_a_browser_shows_balls_points_and_targets(tmp_path: Path) -> None:
         }
         running.start("viewer", port=0, rate=5.0, sensors="['']", marker_setup=LAB)
         image = publishers[setup.image_topic("left")]
-        size, sharpness = ((1360, 820), 1.0) if PICTURES else ((900, 560), 0.4)
         endless = itertools.cycle(frames)
-        with browsing(running, tmp_path, size, sharpness) as page:
+        with browsing(running, tmp_path, (900, 560), 0.4) as page:
             browser = Browser(running, page, [])
 
             def publish() -> bool:
@@ -124,15 +120,6 @@ def test_a_browser_shows_balls_points_and_targets(tmp_path: Path) -> None:
                 return sum(count > 100 for count, _ in page.evaluate(COLOURED)) == 2
 
             browser.until(coloured, "two images with circles in the colours of targets")
-            if PICTURES:
-                for note in page.locator(".mantine-Notification-closeButton").all():
-                    note.dispatch_event("click")
-                for frame in frames:
-                    for topic, cdr in frame.items():
-                        publishers[topic].publish(cdr)
-                    page.wait_for_timeout(100)
-                page.screenshot(path=Path(PICTURES) / "viewer_markers.png", timeout=1e3 * PATIENCE)
-
             # The images are taken only while they are shown.
             assert image.get_subscription_count() == 1
             page.get_by_label("images of cameras").dispatch_event("click")

@@ -1,12 +1,8 @@
-"""Depth cameras in a real browser: the mesh is that of the messages, and images are taken only while they are shown.
-
-With ``BODY_TRACKING_SCREENSHOTS=docs/images`` it writes the picture of the documentation there.
-"""
+"""Depth cameras in a real browser: the mesh is that of the messages, and images are taken only while they are shown."""
 
 from __future__ import annotations
 
 import itertools
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +13,7 @@ rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 pytest.importorskip("viser", reason="viser is not installed")
 
-from browser import PATIENCE, PICTURES, Browser, browsing, need_chromium, pixels_where  # noqa: E402
+from browser import PATIENCE, Browser, browsing, need_chromium, pixels_where  # noqa: E402
 from geometry_msgs.msg import TransformStamped  # noqa: E402
 from running import LATCHED, RELIABLE, ROOT, Running  # noqa: E402
 
@@ -42,7 +38,7 @@ INFO, IMAGES, MESH, SKELETONS = (
     mesh_topic(CAMERA),
     graph.skeleton_topic(mesh_sensor(CAMERA)),
 )
-COUNT = 70 if PICTURES else 8
+COUNT = 8
 VERTICES = """() => {
   const node = window.__viserSceneTree?.getState()["/mesh/kinect1/surface"];
   const vertices = node?.effectiveVisibility ? node.message.props.vertices : null;
@@ -58,7 +54,7 @@ def frames() -> list[dict[str, bytes]]:
     def keep(topic: str, cdr: bytes, at_ns: int) -> None:
         found.setdefault(stamp_of(cdr), {})[topic] = cdr
 
-    values = {"depth": (CAMERA,), "mesh_rate": 10.0, "personalise_from": 5 if PICTURES else 0}
+    values = {"depth": (CAMERA,), "mesh_rate": 10.0, "personalise_from": 0}
     runner = OfflineRunner((MeshStage(check_all(MeshStage.PARAMETERS, values)),), BAG_WIRE, keep)
     with BagReader(BAG) as bag:
         for raw in itertools.islice(bag.messages([INFO, IMAGES]), COUNT + 1):
@@ -88,9 +84,8 @@ def test_a_browser_shows_the_mesh_and_its_image(tmp_path: Path) -> None:
             BAG_WIRE.serialize("geometry_msgs/msg/TransformStamped", pose_to_transform(pose, "world", BAG_MESSAGES))
         )
         running.start("viewer", port=0, rate=5.0, sensors=f"['{mesh_sensor(CAMERA)}']", depth=f"['{CAMERA}']")
-        size, sharpness = ((1360, 820), 1.0) if PICTURES else ((900, 560), 0.4)
         endless = itertools.cycle([frame for frame in played if IMAGES in frame])
-        with browsing(running, tmp_path, size, sharpness) as page:
+        with browsing(running, tmp_path, (900, 560), 0.4) as page:
             browser = Browser(running, page, [])
 
             def publish() -> None:
@@ -115,25 +110,6 @@ def test_a_browser_shows_the_mesh_and_its_image(tmp_path: Path) -> None:
                 return any(share > 0.5 and white > 300 for (_, share), (white, _) in images)
 
             browser.until(coloured, "an image in false colours with an outline")
-            if PICTURES:
-                for note in page.locator(".mantine-Notification-closeButton").all():
-                    note.dispatch_event("click")
-                last = next(frame for frame in reversed(played) if MESH in frame)
-                taken_picture = threading.Event()
-
-                def hold() -> None:
-                    """The page shows nothing that is older than a second, and software draws for longer."""
-                    while not taken_picture.wait(0.2):
-                        for topic, cdr in last.items():
-                            publishers[topic].publish(cdr)
-
-                holding = threading.Thread(target=hold)
-                holding.start()
-                page.wait_for_timeout(5e3)
-                page.screenshot(path=Path(PICTURES) / "viewer_mesh.png", timeout=1e3 * PATIENCE)
-                taken_picture.set()
-                holding.join()
-
             # The images are taken only while they are shown, and the mesh while it or they are.
             taken: Any = publishers[IMAGES].get_subscription_count
             drawn: Any = publishers[MESH].get_subscription_count
