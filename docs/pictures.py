@@ -58,6 +58,14 @@ MOVING = {
 }  # fmt: skip
 """Beginning of an angle's name or kind in ``positional`` and ``rep155``: that of the coordinates that move it in the
 pictures."""
+HAND = ("hand", (Joint.WRIST_LEFT, Joint.HAND_LEFT, Joint.HAND_TIP_LEFT, Joint.THUMB_LEFT))
+CLOSER = {
+    "wrist": HAND, "forearm": HAND, "elbow_pronation": HAND,
+    "neck": ("head", (Joint.SPINE_SHOULDER, Joint.SHOULDER_LEFT, Joint.SHOULDER_RIGHT, Joint.HEAD)),
+    "clavicle": ("shoulders", (Joint.HEAD, Joint.SPINE_MID, Joint.SHOULDER_RIGHT, Joint.ELBOW_LEFT)),
+}  # fmt: skip
+"""Beginning of the name or kind of angles that are drawn closer: the part of the body, and joints that are in the
+picture."""
 CONVENTIONS = ("model", "isb", "positional", "rep155", "dh26")
 KINDS = {
     "waist": "trunk", "r_head": "neck", "p_head": "neck", "l_y_shoulder": "shoulder_plane",
@@ -68,6 +76,10 @@ KINDS = {
 }  # fmt: skip
 """What moves, of angles whose names do not say it: those of the trunk and the left side. Without
 ``y_head``, which moves no point, and theta9 and theta16, which are redundant."""
+
+
+SHAPE = 0.8
+"""Height of an angle's picture over its width."""
 
 
 def points(q: Array) -> Array:
@@ -165,8 +177,10 @@ def panel(axes: Axes, name: str, convention: str) -> None:
     for _ in range(3):
         path.append(moved(path[-1], name, convention, by / 3))
     track = np.stack([points(q) for q in path])
+    closer = next((words for words in CLOSER if kind.startswith(words)), None)
+    part, joints = CLOSER[closer] if closer else ("", tuple(MODEL.joints))
     travel = np.linalg.norm(track[-1] - track[0], axis=1)
-    farthest = int(np.nanargmax(travel))
+    farthest = max(joints, key=lambda joint: float(travel[joint]))
     along = track[-1, farthest] - track[0, farthest]
     choice = [v for v in VIEWS if v != "from the front" or not kind.startswith("wrist")]
     view = min(choice, key=lambda v: (abs(float(along @ np.array(VIEWS[v][0]))), v))
@@ -176,19 +190,25 @@ def panel(axes: Axes, name: str, convention: str) -> None:
     flat = np.stack([track[:, farthest] @ right, track[:, farthest] @ up], axis=-1)
     axes.plot(*flat[:-1].T, color=RED, linewidth=1.6, zorder=4)
     axes.annotate("", flat[-1], flat[-2], arrowprops={"arrowstyle": "-|>", "color": RED, "lw": 1.6}, zorder=5)
-    axes.set_title(name.removesuffix("_left").replace("_", " "), fontsize=8, fontweight="bold", pad=2)
-    axes.text(0.5, -0.02, view, transform=axes.transAxes, ha="center", va="top", fontsize=7, color="#666666")
+    axes.set_title(name.removesuffix("_left").replace("_", " "), fontsize=9, fontweight="bold", pad=3)
+    seen = np.concatenate([track[0][list(joints)], track[-1][list(joints)]]) @ np.stack([right, up], axis=1)
+    middle = 0.5 * (seen.min(axis=0) + seen.max(axis=0))
+    half = float((1.3 * (0.5 * np.ptp(seen, axis=0) + 0.03) * (1.0, 1.0 / SHAPE)).max())
+    if part == "hand":
+        for place, word in ((Joint.THUMB_LEFT, "thumb"), (Joint.HAND_TIP_LEFT, "fingers")):
+            end, wrist = (track[-1, joint] @ np.stack([right, up], axis=1) for joint in (place, Joint.WRIST_LEFT))
+            if np.linalg.norm(end - wrist) > 0.03:
+                axes.text(*(wrist + 1.3 * (end - wrist)), word, fontsize=7, ha="center", va="center", color=BLUE)
+    view = f"{view}: {part}" if part else view
+    axes.text(0.5, -0.04, view, transform=axes.transAxes, ha="center", va="top", fontsize=8, color="#666666")
     axes.set_aspect("equal")
-    half, middle = 1.0, np.array([0.0, 0.0] if view == "from above" else [0.0, 0.2])
-    if kind.startswith(("wrist", "forearm", "elbow_pronation", "neck", "clavicle")):  # closer
-        half = 0.25 if not kind.startswith("clavicle") else 0.5 if convention != "dh26" else 1.0
-        seen = track[
-            0, Joint.HEAD if "neck" in kind else Joint.SHOULDER_LEFT if "clavicle" in kind else Joint.WRIST_LEFT
-        ]
-        middle = np.array([seen @ right, seen @ up]) if half < 1.0 else middle
     axes.set_xlim(middle[0] - half, middle[0] + half)
-    axes.set_ylim(middle[1] - 0.8 * half, middle[1] + 0.8 * half)
-    axes.axis("off")
+    axes.set_ylim(middle[1] - SHAPE * half, middle[1] + SHAPE * half)
+    axes.axis("on")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for edge in axes.spines.values():
+        edge.set_color("#dddddd")
 
 
 def drawn(convention: str) -> list[str]:
@@ -203,7 +223,7 @@ def picture(convention: str) -> None:
     names = drawn(convention)
     columns = 5
     rows = -(-len(names) // columns)
-    figure, grid = plt.subplots(rows, columns, figsize=(10.0, 2.1 * rows), squeeze=False)
+    figure, grid = plt.subplots(rows, columns, figsize=(10.0, 2.0 * rows), squeeze=False)
     for axes in grid.flat:
         axes.axis("off")
     for axes, name in zip(grid.flat, names, strict=False):
