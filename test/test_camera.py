@@ -55,10 +55,10 @@ def test_a_calibration_is_like_another_one_with_the_same_numbers_alone(change: d
 def test_the_jacobian_is_the_derivative(model: str) -> None:
     lens, step = camera(model), 1e-6
     flat = lens.undistort(grid())
-    _, jacobian = lens.distort(flat)
+    jacobian = lens.jacobian(flat)
     for axis in range(2):
         change = step * np.eye(2)[axis]
-        numeric = (lens.distort(flat + change)[0] - lens.distort(flat - change)[0]) / (2.0 * step)
+        numeric = (lens.distort(flat + change) - lens.distort(flat - change)) / (2.0 * step)
         np.testing.assert_allclose(jacobian[..., axis], numeric, atol=1e-7)
 
 

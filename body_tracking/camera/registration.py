@@ -91,7 +91,7 @@ def moved(found: Landmarks, source: Camera, target: Camera) -> Landmarks:
     ratio = float(target.matrix[0, 0] / source.matrix[0, 0])
 
     def place(pixels: FloatArray) -> FloatArray:
-        return target.to_pixels(target.distort(source.undistort(pixels))[0])
+        return target.to_pixels(target.distort(source.undistort(pixels)))
 
     region = Region(place(found.region.centre), found.region.side * ratio, found.region.angle)
     return replace(found, pixels=place(found.pixels), region=region)

@@ -133,6 +133,10 @@ class ArmScene:
         """Intrinsics of the depth images, which are registered to the colour images."""
         return colour_camera(self.width // 2)
 
+    @cached_property
+    def _view(self) -> DepthCamera:
+        return DepthCamera(self.depth)
+
     def joints(self, times: FloatArray) -> FloatArray:
         """(n, 3, 3) metres in the robot's frame: shoulder, elbow and end effector at (n,) s."""
         share = (times - _REST) / _LINE
@@ -173,7 +177,7 @@ class ArmScene:
         rng = np.random.default_rng([self.seed, 41])
         picture += rng.normal(scale=NOISE, size=picture.shape)
         distance = render(points, faces, self.depth).depth
-        empty = measured(distance, DepthCamera(self.depth), np.random.default_rng([self.seed, 42]), self.errors)
+        empty = measured(distance, self._view, np.random.default_rng([self.seed, 42]), self.errors)
         return picture, distance, empty
 
     def _optical(self, points: FloatArray) -> FloatArray:
@@ -220,7 +224,7 @@ class ArmScene:
         shown = exposed(picture, seen, self._parts[1][face], across, rng)
         own = render(vertices, faces, self.depth).depth
         arm = (own > 0.0) & ((distance == 0.0) | (own < distance))
-        depth = measured(np.where(arm, own, distance), DepthCamera(self.depth), rng, self.errors)
+        depth = measured(np.where(arm, own, distance), self._view, rng, self.errors)
         # away from the arm the room's errors stay constant, as in still scenes, which makes recordings small
         return shown, np.where(maximum_filter(arm, 5), depth, empty)
 
