@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -55,12 +56,11 @@ class Scene:
 
     def estimate(self) -> EstimatedSegments:
         """As read from a bag."""
-        states = list(self.angles())
-        stamps_ns = np.array([state.stamp_ns for _, state in states], dtype=np.int64)
+        stamps_ns = np.array([state.stamp_ns for state in self.states], dtype=np.int64)
         position, stddev = (
-            np.stack([getattr(state, part) for _, state in states]) for part in ("position", "position_stddev")
+            np.stack([getattr(each, part) for each in self.angles]) for part in ("position", "position_stddev")
         )
-        series = AngleSeries(stamps_ns, states[0][1].names, position, stddev)
+        series = AngleSeries(stamps_ns, self.angles[0].names, position, stddev)
         rotations = MODEL.forward(self.found, MODEL.default_lengths()).rotations
         return EstimatedSegments(Path("estimate"), graph.MODEL_STATE, stamps_ns, rotations, series, "model", ())
 
@@ -74,16 +74,24 @@ class Scene:
         segments = {name: name for name in self.worn.segments}
         return MarkerReference(Path("markers"), START_NS, tracks, segments, None, ())
 
-    def angles(self) -> list[tuple[ModelEstimate, JointAngles]]:
-        """States of the model and their angles in the convention ``model``."""
+    @cached_property
+    def states(self) -> list[ModelEstimate]:
+        """States of the model."""
         nv = MODEL.nv
         covariance = self.stddev**2 * np.eye(2 * nv)
         rates, lengths = np.zeros(nv), MODEL.default_lengths()
-        made: list[tuple[ModelEstimate, JointAngles]] = []
-        for time, q in zip(self.times.tolist(), self.found, strict=True):
-            stamp_ns = START_NS + round(time * NANOSECONDS)
-            state = ModelEstimate(stamp_ns, "world", 0, q, rates, covariance, lengths, np.zeros_like(lengths))
-            made.append((state, angles_of(state, MODEL, "model", made[-1][1] if made else None)))
+        stamps_ns = [START_NS + round(time * NANOSECONDS) for time in self.times.tolist()]
+        return [
+            ModelEstimate(stamp_ns, "world", 0, q, rates, covariance, lengths, np.zeros_like(lengths))
+            for stamp_ns, q in zip(stamps_ns, self.found, strict=True)
+        ]
+
+    @cached_property
+    def angles(self) -> list[JointAngles]:
+        """Their angles in the convention ``model``."""
+        made: list[JointAngles] = []
+        for state in self.states:
+            made.append(angles_of(state, MODEL, "model", made[-1] if made else None))
         return made
 
     def write_estimate(self, folder: Path) -> Path:
@@ -92,7 +100,7 @@ class Scene:
         with BagWriter(folder, flush_interval_s=float("inf")) as bag:
             for each in (graph.MODEL_STATE, topic, f"{topic}_stddev"):
                 bag.add_topic(each, JOINT_STATE)
-            for state, angles in self.angles():
+            for state, angles in zip(self.states, self.angles, strict=True):
                 messages = (
                     estimate_to_joint_state(state, MODEL, BAG_MESSAGES),
                     *angles_to_joint_states(angles, graph.DEFAULT_BODY, "model", BAG_MESSAGES),

@@ -85,7 +85,7 @@ def folder(one: Scene, other: Scene, tmp_path_factory: pytest.TempPathFactory) -
     exact = replace(one, found=one.true)
     with BagWriter(where / "true", flush_interval_s=float("inf")) as bag:
         bag.add_topic(graph.TRUE_MODEL_STATE, JOINT_STATE)
-        for state, _ in exact.angles():
+        for state in exact.states:
             bag.write_message(
                 graph.TRUE_MODEL_STATE, estimate_to_joint_state(state, MODEL, BAG_MESSAGES), state.stamp_ns
             )
