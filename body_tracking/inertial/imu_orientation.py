@@ -179,7 +179,7 @@ class OrientationEstimator:
     def _has_another_rate(self) -> bool:
         if len(self._intervals) < _RATE_OVER:
             return False
-        ratio = float(np.mean(self._intervals)) / self._step
+        ratio = sum(self._intervals) / len(self._intervals) / self._step  # numpy would copy them at each reading
         return not 1.0 / _RATE_CHANGED < ratio < _RATE_CHANGED
 
     def _restart(self, gap: float) -> None:
@@ -429,6 +429,9 @@ _DISTURBED_FIELD: Final = np.radians(60.0)
 """Standard deviation of a heading by a disturbed field."""
 
 
+_UNIT: Final = np.eye(3)
+
+
 class _Budget:
     """The variances of tilt and heading.
 
@@ -481,13 +484,13 @@ class _Budget:
         self._cross += spread
         # VQF's covariance of the bias gives its gain: P+ = (I - K H) P-; its updates reduce e, but not h
         p_before = np.reshape(before["biasP"], (3, 3)) * _UNIT_OF_BIAS**2
-        p_before = p_before + steps * step * _VQF_WANDER**2 * np.eye(3)
+        p_before = p_before + steps * step * _VQF_WANDER**2 * _UNIT
         p_after = np.reshape(after["biasP"], (3, 3)) * _UNIT_OF_BIAS**2
         kept = np.linalg.solve(p_before, p_after).T
         self._cross = kept @ self._cross
-        self._bias = self._bias + self._errors.gyro_wander**2 * interval * np.eye(3)
+        self._bias = self._bias + self._errors.gyro_wander**2 * interval * _UNIT
         self._bias = kept @ self._bias @ kept.T + p_after - kept @ p_before @ kept.T
-        self._swept += np.outer(up, rate) * interval
+        self._swept += up[:, None] * rate * interval
         self._noise += self._errors.gyro_noise**2 * interval
         squared = float(rate @ rate)
         fades = float(np.exp(-interval / _TURNING_S))
