@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from typing import Any
 
 from body_tracking.core.files import FileError, dump_yaml, load_yaml
@@ -119,11 +120,18 @@ def load(value: object) -> tuple[Qos, ...]:
 
     A value that cannot be read falls back to the default of its policy, so that the recording can still be played.
     """
-    if isinstance(value, str):
-        try:
-            value = load_yaml(value)
-        except FileError:
-            return ()
+    return _load_text(value) if isinstance(value, str) else _profiles(value)
+
+
+@lru_cache(maxsize=64)  # most topics of a recording have the same text
+def _load_text(text: str) -> tuple[Qos, ...]:
+    try:
+        return _profiles(load_yaml(text))
+    except FileError:
+        return ()
+
+
+def _profiles(value: object) -> tuple[Qos, ...]:
     return tuple(_profile(item) for item in value if isinstance(item, dict)) if isinstance(value, list) else ()
 
 
