@@ -128,10 +128,10 @@ def _made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path]
 
 @pytest.fixture(scope="session")
 def wave(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The first 7 s of ``bags/tpose_wave``: the T-pose and some of the wave, for laws that do not need all of it."""
+    """The first 6 s of ``bags/tpose_wave``: the T-pose and some of the wave, for laws that do not need all of it."""
     from excerpts import beginning
 
-    return _made_once(tmp_path_factory, "excerpt", lambda bag: beginning(ROOT / "bags" / "tpose_wave", bag, 7.0))
+    return _made_once(tmp_path_factory, "excerpt", lambda bag: beginning(ROOT / "bags" / "tpose_wave", bag, 6.0))
 
 
 @pytest.fixture(scope="session")

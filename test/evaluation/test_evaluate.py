@@ -130,7 +130,7 @@ def test_fused_skeletons_are_judged_where_asked_or_where_there_are_no_others(
         (["{empty}"], r"empty: /filtered/skeleton is empty"),
         (["{one}"], r"one: 1 skeleton\(s\) .* at least 2"),
         (["{wave}", "--truth", "{two}"], r"two: none of the 2 skeletons of /filtered/skeleton has a trunk"),
-        (["{wave}", "--truth", "{twist}", "--own-clock"], r"do not show the same movement: best correlation"),
+        (["{wave}", "--truth", "{reaching}", "--own-clock"], r"do not show the same movement: best correlation"),
         (
             ["{two}", "--truth", "{twist}"],
             r"do not overlap in time: .*two from 1\.000 to 1\.000 s, .*from 17500000",
@@ -156,6 +156,7 @@ def test_bad_input_is_reported_in_one_line(
     places = {
         "wave": replayed_wave,
         "twist": BAGS / "tpose_torso_twist",
+        "reaching": BAGS / "camera_reaching",
         "text": text,
         "nowhere": tmp_path / "nowhere",
         "empty": bag_of(tmp_path / "empty", 0),

@@ -55,7 +55,7 @@ def test_a_recording_becomes_angles_and_filter_and_convention_may_change_meanwhi
 
 def test_a_rig_in_a_namespace_keeps_its_topics_there_and_ends_with_its_bag(tools: Tools, wave: Path) -> None:
     angles = tools.bench.collect(JointState, f"/lab{ANGLES}")
-    launch = tools.launch(f"bag:={wave}", "namespace:=lab", "record:=live", "rate:=0.4")
+    launch = tools.launch(f"bag:={wave}", "namespace:=lab", "record:=live", "rate:=0.35")
     assert tools.bench.until(lambda: angles, SOON), launch.text()
     names = {name for name, _ in tools.bench.node.get_topic_names_and_types()}
     assert {f"/lab{graph.FUSED}", f"/lab{graph.FILTERED}", f"/lab{graph.CALIBRATION}"} <= names
