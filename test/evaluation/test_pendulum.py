@@ -16,13 +16,13 @@ from body_tracking.evaluation.pendulum import (
 )
 from body_tracking.simulation.baseline_bags import capture_times
 from body_tracking.simulation.baseline_scenes import PendulumScene
-from draws import draws
+from draws import draws, some
 
 BAR = 0.003
 """Hz, over 20 s at 30 Hz."""
 
 
-@pytest.mark.parametrize("degrees", [3.0, 15.0, 30.0])
+@pytest.mark.parametrize("degrees", some([30.0, 3.0, 15.0], 2))
 @pytest.mark.parametrize("length", [0.25, 1.0])
 def test_frequency_does_not_depend_on_the_amplitude(length: float, degrees: float) -> None:
     """The equation of motion, integrated: at 30 degrees its own frequency is 1.7 % lower."""
@@ -60,7 +60,7 @@ def test_the_arc_gives_the_angle_whatever_the_distance_and_the_roll_of_the_camer
 
 def test_frequency_is_within_the_bar_for_every_seed() -> None:
     """10 % lost, times of capture and stamps that are off by 10 ms each, 0.2 pixels of noise, and single outliers."""
-    for seed in (*range(draws(8, 200)), 34, 155):  # in two of which an outlier bent the arc
+    for seed in (*range(draws(4, 200)), 34, 155):  # in two of which an outlier bent the arc
         rng = np.random.default_rng(seed)
         scene = PendulumScene(rng.uniform(0.25, 1.0), rng.uniform(0.05, 0.35), rng.uniform(0.0, 0.05))
         times = capture_times(20.0, rng)
