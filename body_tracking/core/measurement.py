@@ -124,7 +124,8 @@ def body_heading(positions: FloatArray) -> FloatArray:
     Returns:
         (..., 3) metres: the mean of the vectors from right to left shoulder and from right to left hip.
     """
-    axis: FloatArray = left_right_axes(positions).mean(axis=-2)
+    axes = left_right_axes(positions)
+    axis: FloatArray = 0.5 * (axes[..., 0, :] + axes[..., 1, :])  # numpy's mean takes more than twice as long
     return axis
 
 
