@@ -20,7 +20,8 @@ def test_the_notebook_plots_a_recording(tmp_path: Path, wave: Path) -> None:
     cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
     (tmp_path / "notebook.py").write_text("\n".join([*cells, "figure.savefig('angles.png')"]), encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"}
-    replay = (sys.executable, "-m", "body_tracking.cli", "replay", str(wave), "-o", "angles", "--filter", "ekf")
+    options = ("--filter", "ekf", "--convention", "isb")
+    replay = (sys.executable, "-m", "body_tracking.cli", "replay", str(wave), "-o", "angles", *options)
     for command in (replay, (sys.executable, "notebook.py")):
         done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
         assert done.returncode == 0, done.stderr

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 
 import pytest
 
@@ -20,7 +21,7 @@ def test_the_status_line_names_a_calibration_only_where_there_is_something_to_ca
     assert calibration_part(NodeStatus("calibration: state", 0, "calibrated"), ()) == ["calibration: calibrated"]
 
 
-def test_problems_are_named_by_their_nodes() -> None:
+def test_problems_are_named_by_their_nodes(tmp_path: Path) -> None:
     """``up`` prints them while no angles come, and at its end if none came."""
     found = {
         "imu_skeleton": NodeStatus("imu_skeleton: state", 1, "forearm_left: not aligned"),
@@ -39,6 +40,10 @@ def test_problems_are_named_by_their_nodes() -> None:
     assert monitor.summary(options, 3.0, {}) == "played arm in 3.0 s with start and end: 7 frames of joint angles"
     stopped = monitor.summary(options, 3.0, {}, played=False)
     assert stopped == "stopped before the end of arm, after 3.0 s with the start: 7 frames of joint angles"
+    options["record"] = str(tmp_path / "session")
+    assert monitor.summary(options, 3.0, {}).endswith(", nothing was recorded")  # the first message makes it
+    (tmp_path / "session").mkdir()
+    assert monitor.summary(options, 3.0, {}).endswith(f", recorded in {tmp_path / 'session'}")
 
 
 def test_the_recorder_rightly_waits_for_a_bag_that_has_not_begun() -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from body_tracking.camera.topics import (
     COMPRESSED,
+    COMPRESSED_DEPTH,
     COMPRESSION,
     DRIVERS,
     RIG_SENSOR,
@@ -94,6 +95,15 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
         yield NodeSpec("camera_skeleton", "camera_skeleton", defaults=_pictures(options), parameters=own)
 
 
+def _instead(topic: str, topics: Collection[str]) -> str:
+    """What a recording has in place of a camera's topic, for an error."""
+    if any(each.startswith(f"{topic}/compressed") for each in topics):
+        depth = any(each.endswith(COMPRESSED_DEPTH) for each in topics)
+        return f" (it comes compressed: --compressed {'both' if depth else 'colour'})"
+    cameras = sorted({each.split("/")[1] for each in topics if each.endswith("/camera_info")})
+    return f"; it has the cameras {', '.join(cameras)}" if cameras else "; it has no camera"
+
+
 def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
     wanted: list[str] = []
     for camera in _cameras(options):
@@ -105,8 +115,7 @@ def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
             wanted.append(colour)
     for topic in wanted:
         if topic not in topics:
-            compressed = any(each.startswith(f"{topic}/compressed") for each in topics)
-            raise graph.GraphError(f"no topic {topic}{' (it comes compressed: --compressed)' if compressed else ''}")
+            raise graph.GraphError(f"no topic {topic}{_instead(topic, topics)}")
     return tuple(wanted)
 
 

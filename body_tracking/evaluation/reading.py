@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
@@ -20,7 +20,7 @@ from body_tracking.kinematics.positional import ANGLE_NAMES
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.base import MessageError, to_nanoseconds
 from body_tracking.messages.calibration import time_reference_to_clock, transform_to_pose
-from body_tracking.messages.cdr import decode_skeletons
+from body_tracking.messages.cdr import decode_skeletons, stamp_of
 from body_tracking.messages.model import coordinates_to_configuration
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.pipeline import graph
@@ -160,14 +160,18 @@ def read(path: Path, body: str | None = None, truth: Path | None = None) -> Trac
 
     Raises:
         BagError: no such bag, or it is unreadable.
-        EvaluationError: no joint angles, or none of this person.
+        EvaluationError: no joint angles, or none of this person; or the truth is that of another recording.
     """
     with RigReader(path) as bag:
         if not bodies(bag):
             raise EvaluationError(f"{path}: holds no joint angles ({_PREFIX}<id>{_SUFFIX}); make some with replay")
         body, angles = read_angles(bag, body)
         skeletons = read_skeletons(bag, graph.FILTERED)
+        sensors = {} if truth is None else _sensor_stamps(bag, bag.topics)
     with RigReader(truth or path) as bag:
+        for topic, stamps in _sensor_stamps(bag, sensors).items():
+            if stamps.isdisjoint(sensors[topic]):
+                raise EvaluationError(f"{truth}: is another recording than {path}: no frame of {topic} is in both")
         topic = graph.true_angles_topic(body)
         own = read_joint_states(bag, topic if topic in bag.topics else graph.TRUE_ANGLES, body)
         coordinates = read_joint_states(bag, graph.TRUE_MODEL_STATE, "")
@@ -181,6 +185,15 @@ def read(path: Path, body: str | None = None, truth: Path | None = None) -> Trac
             true_angles=true_angles(angles.names, own, coordinates),
             true_skeletons=read_skeletons(bag, graph.TRUE_SKELETON),
         )
+
+
+def _sensor_stamps(bag: BagReader, topics: Collection[str]) -> dict[str, set[int]]:
+    """The stamps of the sensors' skeletons in a bag, of those of these topics that it has."""
+    wanted = [topic for topic in map(graph.skeleton_topic, graph.sensors_among(bag.topics)) if topic in topics]
+    found: dict[str, set[int]] = {}
+    for raw in bag.messages(wanted) if wanted else ():
+        found.setdefault(raw.topic, set()).add(stamp_of(raw.cdr))
+    return found
 
 
 def true_angles(names: tuple[str, ...], own: AngleSeries | None, coordinates: AngleSeries | None) -> AngleSeries | None:

@@ -13,7 +13,7 @@ three shipped recordings, which are simulated. Figures over these recordings are
   spine as in the hips, and less later (Esola et al., Spine 21 (1996) 71), so that both get the same deviation
 - the others: a share of the range to one side in :mod:`body_tracking.kinematics.ranges`, whose sources stand there; a
   third for lateral bending*, the neck and the wrist, half for axial rotations and the clavicle (chosen on 16 simulated
-  and five real people, ``docs/accuracy.md``: a quarter drew raised arms down). Forearms turn by 50 deg either way in
+  and five real people, ``docs/tried.md``: a quarter drew raised arms down). Forearms turn by 50 deg either way in
   daily activities (Morrey et al., J. Bone Joint Surg. Am. 63 (1981) 872)
 - elbows: uniform over their range, since no flexion is more usual than another
 """

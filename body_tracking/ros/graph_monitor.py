@@ -6,6 +6,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import rclpy
@@ -221,7 +222,8 @@ class GraphMonitor:
         problems = () if self.angles else problem_parts(self._statuses)
         text += f" ({'; '.join(problems)})" if problems else ""
         if options["record"]:
-            text += f", recorded in {options['record']}"
+            made = Path(str(options["record"])).exists()
+            text += f", recorded in {options['record']}" if made else ", nothing was recorded"
         if restarts:
             text += "; restarts: " + ", ".join(f"{name} {count}" for name, count in restarts.items())
         return text

@@ -239,3 +239,6 @@ def test_the_truth_may_be_in_the_bag_that_was_played(replayed_wave: Path, wave: 
     assert elbow["rms_error"] < elbow["max_error"] and elbow["true_min"] < 30.0 and elbow["true_max"] > 80.0
     with pytest.raises(EvaluationError, match="holds no truth"):
         summarise(replayed_wave, truth=bare(tmp_path / "bare"))
+    other = Path(__file__).parents[2] / "bags" / "tpose_slow_down"  # simulated at the same time
+    with pytest.raises(EvaluationError, match="tpose_slow_down: is another recording than"):
+        summarise(replayed_wave, truth=other)

@@ -337,7 +337,7 @@ def test_a_recording_without_skeletons_is_refused_with_the_options_for_it(tmp_pa
 
 def test_a_sensor_that_a_recording_lacks_is_refused_with_those_that_it_has(tmp_path: Path, command: Command) -> None:
     """Not with all its topics; an inertial sensor in the form of the option ``--imus``."""
-    five, out = BAG.with_name("five_systems"), ("-o", tmp_path / "out")
+    five, coloured, out = BAG.with_name("five_systems"), BAG.with_name("camera_reaching"), ("-o", tmp_path / "out")
     worn = "forearm_left, forearm_right, pelvis, upper_arm_left, upper_arm_right, upper_trunk"
     for words, said in (
         (("replay", five, *out, "--sensors", "kinect1,kinect9"), "kinect9/skeleton; its sensors are kinect1, kinect2"),
@@ -345,6 +345,9 @@ def test_a_sensor_that_a_recording_lacks_is_refused_with_those_that_it_has(tmp_p
         (("replay", five, *out, "--imus", "hand_left"), f"for hand_left; its inertial sensors are {worn}"),
         (("replay", BAG, *out, "--imus", "hand_left"), "for hand_left; it has no topic /<segment>/imu/data"),
         (("up", "--bag", BAG, "--imus", "hand_left"), "for hand_left; it has no topic /<segment>/imu/data"),
+        (("replay", coloured, *out, "--camera", "cam1"), "/cam1/color/camera_info; it has the cameras camera1"),
+        (("replay", coloured, *out, "--camera", "camera1"), "(it comes compressed: --compressed colour)"),
+        (("replay", BAG, *out, "--camera", "camera1"), "/camera1/color/camera_info; it has no camera"),
     ):
         code, _, error = command(*words)
         assert code == 2 and error.count("\n") == 1

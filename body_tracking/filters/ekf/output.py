@@ -74,7 +74,7 @@ class Output:
 
         An offset of a shoulder changes the elevation of its clavicle by nearly the same angle in every pose. So the
         prior corrects the mean of this elevation, and the filter keeps the changes. A prior of each pose alone would
-        draw a raised shoulder down (docs/accuracy.md, "Shoulders that rise").
+        draw a raised shoulder down (docs/tried.md, "Shoulders that rise").
         """
         mean = np.full(len(self._postural), np.nan)
         if state.mean_posture is not None and state.sensors:  # orientations alone do not show a clavicle's motion

@@ -259,7 +259,7 @@ def _slow_parts(sensor: SensorState, measurement: Measurement) -> tuple[FloatArr
     The scale is estimated over all points, mostly while the sensor sees the person well: 0.1 for one who faces it. From
     the side a Kinect v2 errs by three times as much, which it states, and most of all at the far arm. With the same
     scale there, the filter would follow it against a sensor in front. So a scale below 1 applies to the least variance
-    stated lately, and what is stated beyond stays whole (docs/accuracy.md, "What a sensor sees from the side"). A
+    stated lately, and what is stated beyond stays whole (docs/tried.md, "What a sensor sees from the side"). A
     single sensor has none to follow instead. With a scale of 0 the sensor has no systematic errors.
 
     Tried and left: a margin of twice the least variance (nothing is gained), and instead a lower bound of the scale of
