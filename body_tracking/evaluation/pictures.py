@@ -19,7 +19,13 @@ from body_tracking.evaluation.reading import AngleSeries, Tracked, nearest, true
 from body_tracking.evaluation.report import named_are_positional, write
 from body_tracking.kinematics.labels import limb_of
 
-_COLOURS = {"left": "#1f6fb4", "right": "#d1571b", "": "#3a3a3a"}
+_COLOURS = {"left": "#2a86d6", "right": "#e8712f", "": "#7d8793"}
+_TRUE_COLOURS = {"left": "#0020a0", "right": "#991500", "": "#000000"}
+"""Darker shades of the same colours: the truths of both sides are told apart, and show on the lines that they cover."""
+_DASHES = (0.0, (4.0, 3.0))
+"""Of truths: with gaps in which the line below shows."""
+_TRUNK = "#3a3a3a"
+"""Of the person's bones without a side: dark, since the true person is grey."""
 _COLUMNS, _INSTANTS = 4, 6
 _POINTS = 1500
 """Largest number of points of a curve; the picture has no more columns."""
@@ -167,14 +173,16 @@ def _draw_angles(figure: Any, angles: AngleComparison, still: float = _STILL) ->
     found, true = np.degrees(found), np.degrees(true)
     for axis, (title, columns) in zip(axes.flat, panels.items(), strict=False):
         for column in columns:
-            colour, curve = _COLOURS[_side(angles.names[column])], _unbroken(found[:, column])
+            side, curve = _side(angles.names[column]), _unbroken(found[:, column])
+            colour = _COLOURS[side]
             low, high = curve - band[:, column], curve + band[:, column]
             axis.fill_between(times, low, high, color=colour, alpha=0.18, linewidth=0.0)
-            axis.plot(times, curve, color=colour, linewidth=1.3)
+            axis.plot(times, curve, color=colour, linewidth=1.6)
             # isolated known angles have no line, so draw a dot
             around = np.pad(np.isfinite(curve), 1)
             axis.plot(*np.array([times, curve])[:, around[1:-1] & ~around[:-2] & ~around[2:]], ".", color=colour)
-            axis.plot(times, _unbroken(true[:, column]), "--", color="black", linewidth=0.8)
+            truth = _unbroken(true[:, column])
+            axis.plot(times, truth, linestyle=_DASHES, color=_TRUE_COLOURS[side], linewidth=1.0)
         edge = np.nan_to_num(np.minimum(band[:, columns], 30.0))  # wider bands would flatten the curves
         edges = np.concatenate([found[:, columns] - edge, found[:, columns] + edge, true[:, columns]])
         least, most = (np.nanmin(edges), np.nanmax(edges)) if np.isfinite(edges).any() else (0.0, 0.0)
@@ -223,8 +231,8 @@ def _draw_person(figure: Any, tracked: Tracked, start_ns: int) -> None:
 
 def _draw_bones(axis: Any, points: FloatArray, **style: Any) -> None:
     for bone in BONES:
-        colour = _COLOURS[_side(Joint(bone[1]).name.lower())]
-        axis.plot(*points[list(bone)].T, **{"color": colour, "linewidth": 1.6} | style)
+        side = _side(Joint(bone[1]).name.lower())
+        axis.plot(*points[list(bone)].T, **{"color": _COLOURS[side] if side else _TRUNK, "linewidth": 1.6} | style)
 
 
 def _left(skeletons: Iterable[Skeleton]) -> npt.NDArray[np.complex128]:
