@@ -44,7 +44,8 @@ _BONES: Final = (
     ("SHOULDER_LEFT", "SHOULDER_RIGHT"),
     ("HIP_LEFT", "HIP_RIGHT"),
 )
-_LEFT, _RIGHT, _GUESSED = (255, 140, 0), (0, 170, 255), (160, 160, 160)
+_LEFT, _RIGHT, _GUESSED = (0, 170, 255), (255, 140, 0), (160, 160, 160)
+"""Red, green, blue; left and right as in the pictures of ``show``."""
 
 
 class Pictures:
@@ -76,7 +77,7 @@ class Pictures:
 
 
 def draw(image: NDArray[np.uint8], found: Landmarks) -> None:
-    """Draw a person into an image (height, width, 3) of red, green, blue: left orange, right blue, guessed grey."""
+    """Draw a person into an image (height, width, 3) of red, green, blue: left blue, right orange, guessed grey."""
     thick = max(1, round(found.region.side / 250))
 
     def place(landmark: Landmark) -> tuple[int, int]:

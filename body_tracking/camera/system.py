@@ -206,7 +206,7 @@ SYSTEM = System(
             COMPRESSED_IMAGE,
             RELIABLE,
             "camera_skeleton",
-            "the colour images of each camera of either node with the people drawn in, left orange and right blue, "
+            "the colour images of each camera of either node with the people drawn in, left blue and right orange, "
             "JPEG; with the parameter `picture_rate`, which `--viewer` sets, and only while there is a subscriber",
         ),
     ),
