@@ -46,7 +46,7 @@ BONES = (
     (Joint.WRIST_RIGHT, Joint.HAND_RIGHT), (Joint.HAND_RIGHT, Joint.HAND_TIP_RIGHT),
     (Joint.WRIST_RIGHT, Joint.THUMB_RIGHT),
 )  # fmt: skip
-# name: the direction of sight, and what stands to the right and up in the picture; x forward, y to the person's left
+# name: the directions to the viewer, and to the right and up in the picture; x forward, y to the person's left
 VIEWS = {
     "from the front": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
     "from the left": ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
@@ -114,7 +114,9 @@ def start(name: str) -> Array:
     out = {"shoulder_x_left": 35.0, "shoulder_x_right": -35.0}
     if "plane" in name:
         return pose(shoulder_x_left=70.0, shoulder_x_right=-35.0)
-    if "rotation" in name or "pronation" in name:
+    if "pronation" in name:  # less, and the thumb begins on the line of the upper arm
+        return pose(elbow_flexion_left=90.0, forearm_pronation_left=25.0, **out)
+    if "rotation" in name:
         return pose(elbow_flexion_left=90.0, **out)
     if "wrist" in name:
         return pose(elbow_flexion_left=90.0, **out)
@@ -157,10 +159,10 @@ def moved(q: Array, name: str, convention: str, by: float) -> Array:
 
 
 def draw(axes: Axes, at: Array, view: str, colour: str | None, width: float) -> None:
-    """The bones of a body; without a colour the left side is blue, the right one orange."""
-    _, right, up = (np.array(axis) for axis in VIEWS[view])
-    flat = np.stack([at @ right, at @ up], axis=-1)
-    for one, two in BONES:
+    """The bones of a body, the nearest last; without a colour the left side is blue, the right one orange."""
+    viewer, right, up = (np.array(axis) for axis in VIEWS[view])
+    flat, near = np.stack([at @ right, at @ up], axis=-1), at @ viewer
+    for one, two in sorted(BONES, key=lambda bone: float(near[list(bone)].sum())):
         side = BLUE if "LEFT" in two.name else ORANGE if "RIGHT" in two.name else "#333333"
         axes.plot(*flat[[one, two]].T, color=colour or side, linewidth=width, solid_capstyle="round", zorder=2)
     if view != "from above":
