@@ -156,6 +156,7 @@ def draw(arm: Arm, path: Path) -> None:
     """Draw commands and joints over time, and the arm at some instants."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     times, told, stood = np.array(arm.times), np.degrees(arm.told), np.degrees(arm.stood)
     given = np.isfinite(told).all(axis=1)
@@ -185,11 +186,17 @@ def draw(arm: Arm, path: Path) -> None:
         shade = 0.85 - 0.85 * number / (len(instants) - 1)
         picture.plot(*points.T, "-o", color=(shade, shade, shade), markersize=3)
     picture.set_title(f"{arm.mapping.robot}, light to dark", fontsize=9)
-    picture.set(xlabel="x forward (m)", ylabel="y left (m)", zlabel="z up (m)")
-    middle = float(np.mean(picture.get_ylim()))
-    picture.set_ylim(min(picture.get_ylim()[0], middle - 0.2), max(picture.get_ylim()[1], middle + 0.2))
-    picture.locator_params(nbins=4)
-    picture.set_aspect("equal")
+    picture.set_xlabel("x forward (m)", labelpad=8)
+    picture.set_ylabel("y left (m)", labelpad=8)
+    picture.zaxis.set_rotate_label(False)  # to be read upwards, whichever way the axis leans
+    picture.set_zlabel("z up (m)", labelpad=8, rotation=90)
+    low, high = np.min(arm.points, axis=(0, 1)), np.max(arm.points, axis=(0, 1))
+    sizes = np.maximum(1.1 * (high - low), 0.5 * (high - low).max())  # on a narrow side the ticks would overlap
+    ends = 0.5 * (low + high) + 0.5 * np.array([-sizes, sizes])
+    picture.set(xlim=ends[:, 0], ylim=ends[:, 1], zlim=ends[:, 2])
+    for axis in (picture.xaxis, picture.yaxis, picture.zaxis):
+        axis.set_major_locator(MaxNLocator(2))  # intervals: at most three ticks
+    picture.set_box_aspect(sizes, zoom=0.85)
     picture.view_init(elev=15, azim=-60)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, format="png")
