@@ -151,9 +151,10 @@ def draw_scene(axes: plt.Axes, tracked: Tracked) -> None:
         edge = np.array([[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]], dtype=float)
         far = (0.2 * camera.rays(edge) - translation) @ rotation
         near = np.tile(-translation @ rotation, (4, 1))
-        lines = [*np.stack([near, far], axis=1), *np.stack([far, np.roll(far, 1, axis=0)], axis=1)]
-        axes.add_collection3d(Line3DCollection(upright(np.array(lines)), colors="0.35", linewidths=1.0))
-        axes.text(*upright(near[0] - np.array([0.0, 0.08, 0.0])), setup.camera_name(camera.frame_id), ha="center")
+        lines = upright(np.array([*np.stack([near, far], axis=1), *np.stack([far, np.roll(far, 1, axis=0)], axis=1)]))
+        axes.add_collection3d(Line3DCollection(lines, colors="0.35", linewidths=1.0))
+        below = [*lines[..., :2].mean(axis=(0, 1)), lines[..., 2].min() - 0.06]
+        axes.text(*below, setup.camera_name(camera.frame_id), ha="center", va="top")
     for pose in poses:
         balls = upright(tracked.targets[pose.name].points @ pose.rotation.T + pose.translation)
         colour = np.array(tracked.colours[pose.name]) / 255.0
