@@ -1,7 +1,7 @@
 """README.md and the pages in ``docs/``: every command in them runs, or states why not.
 
 The rule: blocks fenced as ``sh`` of a page are run one after the other, by bash, in a folder that has everything of
-the repository (and nothing of the page before; of one recording, its first 7 s), and must all end with exit code 0. A
+the repository (and nothing of the page before; of one recording, its first 4 s), and must all end with exit code 0. A
 block that needs a device, ROS's own ``ros2``, or more time than a test has begins with the line ``# needs hardware:
 ...``, ``# needs ROS: ...`` or ``# takes long: ...``. A block of another language that begins with ``# name.ext`` is
 written to that file first, so that commands can use it.

@@ -110,6 +110,8 @@ def test_a_browser_shows_the_mesh_and_its_image(tmp_path: Path) -> None:
                 return any(share > 0.5 and white > 300 for (_, share), (white, _) in images)
 
             browser.until(coloured, "an image in false colours with an outline")
+            assert not page.get_by_label("body", exact=True).is_checked()  # capsules, which would cover the mesh
+
             # The images are taken only while they are shown, and the mesh while it or they are.
             taken: Any = publishers[IMAGES].get_subscription_count
             drawn: Any = publishers[MESH].get_subscription_count
