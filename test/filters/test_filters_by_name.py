@@ -123,10 +123,9 @@ ANEW = {"backward_jumps": (-50, "world"), "frame_changes": (2, "map"), "gaps": (
 )
 def test_a_restarted_filter_equals_a_new_one(name: str, cause: str) -> None:
     later, frame_id = ANEW[cause]
-    # After a gap it is still the same person, whose joints are where a T-pose has shown them. A defect of the extended
-    # filter: it corrects the first frame of another frame of reference by the T-pose of the person before.
-    learning = cause != "gaps" and (name, cause) != ("ekf", "frame_changes")
-    parameters = {} if learning or name not in (*LINEAR_MODELS, "ekf") else {"t_pose": False}
+    # after a gap it is still the same person, whose joints are where a T-pose has shown them
+    learning = cause != "gaps"
+    parameters = {} if learning or name not in LINEAR_MODELS else {"t_pose": False}
     tested, fresh = fed(name, FRAMES, **parameters), fed(name, **parameters)
     assert tested.counters.get("t_poses", 1) == learning
     counted = dict(tested.counters)

@@ -183,7 +183,9 @@ class ExtendedKalmanFilter:
             state = self._state
         if state is not None and not self._in_time(measurement, state):
             return False
-        state = self._last  # a jump of time may have reset it
+        if state is not None and self._last is None:  # reset: the joint centres were those of the person before
+            measurement = self._measurement(skeleton, sensor)
+        state = self._last
         self.counters["frames"] += 1
         if self.parameters.t_pose and self._centres.update(skeleton, sensor):
             self._lengths_from_ns = skeleton.stamp_ns
