@@ -11,7 +11,7 @@ pytest.importorskip("rclpy", reason="ROS is not installed")
 
 from body_tracking.messages.node_status import NodeStatus
 from body_tracking.pipeline.system import Options
-from body_tracking.ros.graph_monitor import GraphMonitor, calibration_part, problem_parts
+from body_tracking.ros.graph_monitor import GraphMonitor, calibration_part, losses_part, problem_parts
 from body_tracking.systems import options_of
 
 
@@ -44,6 +44,23 @@ def test_problems_are_named_by_their_nodes(tmp_path: Path) -> None:
     assert monitor.summary(options, 3.0, {}).endswith(", nothing was recorded")  # the first message makes it
     (tmp_path / "session").mkdir()
     assert monitor.summary(options, 3.0, {}).endswith(f", recorded in {tmp_path / 'session'}")
+
+
+def test_messages_that_a_node_did_not_process_are_reported_where_they_are_many() -> None:
+    def status(**values: int) -> NodeStatus:
+        return NodeStatus("", 0, "", {key.replace("_", " "): str(value) for key, value in values.items()})
+
+    found = {
+        "marker_detector": status(received=82, **{"lost /left/image_raw": 89, "dropped /right/image_raw": 4}),
+        "fusion": status(received=1000, **{"lost /kinect1/skeleton": 9}),
+        "bag_recorder": status(received=1000, lost=0),
+    }
+    text = "messages not processed (machine or network too slow): marker_detector 93"
+    assert losses_part(found) == [text]
+    monitor = object.__new__(GraphMonitor)  # without a node
+    monitor._statuses, monitor.angles = found, 7
+    assert monitor.summary({"bag": "", "record": None}, 3.0, {}) == f"ran for 3.0 s: 7 frames of joint angles; {text}"
+    assert losses_part({"fusion": found["fusion"]}) == []
 
 
 def test_the_recorder_rightly_waits_for_a_bag_that_has_not_begun() -> None:

@@ -32,6 +32,10 @@ from body_tracking.ros.bag_topics import to_profile
 _CHAIN = ("skeleton_filter", "joint_angles")
 _OWN_PART = ("calibration", "robot_commands")
 """Nodes that have a part of their own in the status line."""
+_LOSSES = ("dropped ", "lost ", "left out after a standstill ")
+"""Beginnings of the keys, before the topic, by which a node counts messages that it did not process."""
+_NOTABLE_LOSS = 0.01
+"""Share of a node's received messages."""
 _FRESH = 3.0
 """Seconds for which a node's diagnostics are valid."""
 
@@ -54,6 +58,16 @@ def problem_parts(statuses: Mapping[str, NodeStatus], *, bag_starts: bool = Fals
     if bag_starts and "bag_recorder" in bad and statuses["bag_recorder"].level == 1:
         del bad["bag_recorder"]
     return [f"{name}: {text}" for name, text in sorted(bad.items())]
+
+
+def losses_part(statuses: Mapping[str, NodeStatus]) -> list[str]:
+    """The messages that nodes did not process, where they are more than one in a hundred received ones."""
+    found = []
+    for name, status in sorted(statuses.items()):
+        counts = [status.number(key) or 0.0 for key in status.values if key.startswith(_LOSSES)]
+        if sum(counts) > _NOTABLE_LOSS * (status.number("received") or 0.0):
+            found.append(f"{name} {sum(counts):.0f}")
+    return [f"messages not processed (machine or network too slow): {', '.join(found)}"] if found else []
 
 
 class GraphMonitor:
@@ -171,6 +185,7 @@ class GraphMonitor:
         malformed = sum(int(status.values.get("malformed", 0)) for status in fresh.values())
         if malformed:
             parts.append(f"malformed {malformed}")
+        parts += losses_part(fresh)
         values = {f"{key}: {value}" for status in fresh.values() for key, value in status.values.items()}
         parts += sorted(each for each in values if each.startswith("publishers "))
         if options["robot"]:
@@ -224,6 +239,7 @@ class GraphMonitor:
         if options["record"]:
             made = Path(str(options["record"])).exists()
             text += f", recorded in {options['record']}" if made else ", nothing was recorded"
+        text += "".join(f"; {part}" for part in losses_part(self._statuses))
         if restarts:
             text += "; restarts: " + ", ".join(f"{name} {count}" for name, count in restarts.items())
         return text
