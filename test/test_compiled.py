@@ -97,7 +97,7 @@ def test_a_user_reads_why_a_program_waits_while_it_compiles(tmp_path: Path, cach
 
 def test_one_process_can_compile_several_systems() -> None:
     """As it has to where there are fewer processors than systems."""
-    once = "compilation._seconds('body_tracking.fusion.association:prepare')"
+    once = "compilation._seconds('body_tracking.markers.detection:prepare')"
     command = [sys.executable, "-c", f"from body_tracking import compilation; {once}; {once}"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert (done.returncode, done.stderr) == (0, "")

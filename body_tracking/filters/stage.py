@@ -20,7 +20,6 @@ from body_tracking.filters import (
 from body_tracking.filters.people import PeopleFilter, filter_of
 from body_tracking.filters.person import DEFAULT_ORDER_WAIT, DEFAULT_PREDICT_AFTER, FilterSettings, PersonFilter
 from body_tracking.filters.smoothing import MAX_LAG
-from body_tracking.fusion import association
 from body_tracking.fusion.stage import calibration_inputs
 from body_tracking.messages.codecs import (
     Ids,
@@ -208,13 +207,8 @@ class FilterStage(Stage):
         )
 
     def start(self, now: Now) -> Iterable[Output]:
-        self._prepare()
-        return ()
-
-    def _prepare(self) -> None:
         prepare(str(self.values["filter"]))
-        if self.filter.by_sensor:
-            association.prepare()
+        return ()
 
     def change(self, values: Mapping[str, Value]) -> None:
         """Start a new filter at the next frame; frames that the present one holds back are published."""
@@ -222,7 +216,7 @@ class FilterStage(Stage):
         self.filter.flush()
         made.inherit(self.filter)
         self.filter, self.values = made, values
-        self._prepare()
+        prepare(str(values["filter"]))
         self._connect(values)
         there = {port.topic for port in self.outputs}
         self._published = [output for output in self._published if output.topic in there]

@@ -2,9 +2,8 @@
 
 Each frame of one sensor is assigned at its own time. A person is predicted from the last sighting by the same sensor or
 by another one, whichever has the smaller variance, with a decaying velocity; the variance grows with the time since.
-The assignment of bodies to people within the gate minimises the total cost (Kuhn 1955;
-``scipy.optimize.linear_sum_assignment``), the negative log-likelihood of the distance between torsos. The sensor's own
-number of a body is evidence only.
+The assignment of bodies to people within the gate minimises the total cost (``assignment``), the negative
+log-likelihood of the distance between torsos. The sensor's own number of a body is evidence only.
 
 Torsos are compared by points that do not change when a sensor swaps left and right, and by the median of their
 distances, which one outlier does not move.
@@ -14,13 +13,13 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 
 import numpy as np
 
-from body_tracking.core.skeleton import NANOSECONDS, FloatArray, IntArray, Joint, Skeleton
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton
+from body_tracking.fusion.assignment import least_cost_assignment
 from body_tracking.pipeline.people import HOLD
 
 _MIDLINE = np.array([Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER, Joint.NECK], dtype=np.intp)
@@ -170,19 +169,6 @@ class _Person:
         carried = math.copysign(_VELOCITY_DECAY * -math.expm1(-abs(elapsed) / _VELOCITY_DECAY), elapsed)
         result: FloatArray = last.points + carried * velocity
         return result
-
-
-@cache
-def _min_cost_assignment() -> Callable[[FloatArray], tuple[IntArray, IntArray]]:
-    from scipy.optimize import linear_sum_assignment
-
-    found: Callable[[FloatArray], tuple[IntArray, IntArray]] = linear_sum_assignment
-    return found
-
-
-def prepare() -> None:
-    """Import the assignment solver: that takes half a second, too long for a second person's first frame."""
-    _min_cost_assignment()
 
 
 class Association:
@@ -342,9 +328,7 @@ class Association:
             [[person.bodies.get(sensor) == number for number in numbers] for person in people]
         )
         costs[~(distances <= np.array(gate)[:, None])] = _IMPOSSIBLE
-        rows: IntArray
-        columns: IntArray
-        rows, columns = _min_cost_assignment()(costs)
+        rows, columns = least_cost_assignment(costs)
         for row, column in zip(rows, columns, strict=True):
             if costs[row, column] < _IMPOSSIBLE:
                 whose[column] = people[row]
@@ -368,7 +352,7 @@ class Association:
         expected = np.stack([person.expected(other, stamp_ns) for person, other in present])
         distances = np.minimum(torso_distances(expected, points[columns]), 2.0 * GATE)
         now = distances[list(mine.values()), range(len(columns))].sum()
-        rows, chosen = _min_cost_assignment()(distances)
+        rows, chosen = least_cost_assignment(distances)
         if now - distances[rows, chosen].sum() <= _MARGIN:
             self._contested.pop(sensor, None)
             return whose

@@ -8,7 +8,6 @@ from typing import Any
 from body_tracking.core.parameters import Value, fields_of, parameters_from
 from body_tracking.core.qos import LATCHED
 from body_tracking.core.skeleton import Skeleton
-from body_tracking.fusion import association
 from body_tracking.fusion.fusion import FusionParameters
 from body_tracking.fusion.people_fusion import PeopleFusion
 from body_tracking.messages.codecs import Clock, Pose, Skeletons
@@ -57,10 +56,6 @@ class FusionStage(Stage):
         self._sensors = {graph.skeleton_topic(sensor): sensor for sensor in sensors}
         self.inputs = (*calibration_inputs(len(sensors)), *(skeleton_input(topic, values) for topic in self._sensors))
         self.outputs = (Port(graph.FUSED, Skeletons(), skeleton_qos(values), measured=True),)
-
-    def start(self, now: Now) -> Iterable[Output]:
-        association.prepare()
-        return ()
 
     def change(self, values: Mapping[str, Value]) -> None:
         """From the next frame on."""

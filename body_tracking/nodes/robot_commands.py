@@ -106,7 +106,9 @@ class RobotCommands(GraphNode):
         """Pair angles and their standard deviations by stamp, and pass pairs to the follower."""
         if self.sequences.switched[topic] != self.switched[topic]:
             self.switched[topic] = self.sequences.switched[topic]
-            self.follower.refuse_angles(f"{topic}: angles of another publisher than before (a restarted node, or two at a time)")
+            self.follower.refuse_angles(
+                f"{topic}: angles of another publisher than before (a restarted node, or two at a time)"
+            )
         stamp_ns = to_nanoseconds(message.header.stamp)
         self.monitor.message_in(topic, stamp_ns)
         pair = self.waiting.setdefault(stamp_ns, {})

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from body_tracking.calibration.joint_centres import JointCentres
 from body_tracking.core.measurement import joint_correlation
@@ -31,7 +30,10 @@ class Displacement:
         joints = space.model.joints
         correlation = joint_correlation()[np.ix_(joints, joints)]
         self._correlation = np.kron(correlation, np.eye(_DIMENSIONS))
-        self._prior_information = block_diag(np.diag(space.rest_information), np.linalg.inv(space.lengths_covariance))
+        tangent = len(space.rest_information)
+        self._prior_information = np.zeros((space.observed, space.observed))
+        self._prior_information[:tangent, :tangent] = np.diag(space.rest_information)
+        self._prior_information[tangent:, tangent:] = np.linalg.inv(space.lengths_covariance)
 
     def displaced(self, state: State) -> tuple[FloatArray, FloatArray]:
         """(53, 53) covariance of tangent and lengths by offsets of the joint centres; (53,) change by rejected points.
