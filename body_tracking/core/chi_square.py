@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 
 def tail(dimension: int, value: float) -> float:
@@ -20,6 +21,7 @@ def tail(dimension: int, value: float) -> float:
     return probability
 
 
+@lru_cache(maxsize=256)
 def gate(dimension: int, probability: float) -> float:
     """The value that a chi-square number exceeds with the given probability; infinity for 0.
 

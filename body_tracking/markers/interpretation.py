@@ -15,9 +15,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from body_tracking.core import chi_square
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.markers.observations import Points
-from body_tracking.markers.pose import FEWEST, balls_covariance, chi_square_gate, maximum_likelihood
+from body_tracking.markers.pose import FEWEST, balls_covariance, maximum_likelihood
 from body_tracking.markers.search import Deadline
 from body_tracking.markers.targets import Target
 
@@ -143,7 +144,7 @@ def _fit(
         points.covariance[chosen],
         None if known_shape else np.stack([balls_covariance(each.target, np.array(each.seen)) for each in fittings]),
     )
-    gate = chi_square_gate(3 * size - 6, missed)
+    gate = chi_square.gate(3 * size - 6, missed)
     for row in np.flatnonzero(fits.chi_square <= gate).tolist():
         each = fittings[row]
         yield (

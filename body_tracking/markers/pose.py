@@ -9,11 +9,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Final
 
 import numpy as np
-from scipy.special import gammainccinv
 
 from body_tracking.core.compiled import compiled
 from body_tracking.core.compiled_so3 import turned
@@ -55,12 +53,6 @@ class Fits:
     covariance: FloatArray
     chi_square: FloatArray
     residual: FloatArray
-
-
-@lru_cache(maxsize=256)
-def chi_square_gate(degrees: int, missed: float) -> float:
-    """The value that a chi-square variable with these degrees of freedom exceeds with probability ``missed``."""
-    return 2.0 * float(gammainccinv(0.5 * degrees, missed))
 
 
 def umeyama(model: FloatArray, measured: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:

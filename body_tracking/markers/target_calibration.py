@@ -12,11 +12,11 @@ from typing import Final
 
 import numpy as np
 
-from body_tracking.core import so3
+from body_tracking.core import chi_square, so3
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
 from body_tracking.markers.observations import Points
-from body_tracking.markers.pose import FEWEST, chi_square_gate, umeyama
+from body_tracking.markers.pose import FEWEST, umeyama
 from body_tracking.markers.recognition import Recogniser
 from body_tracking.markers.targets import Target
 
@@ -89,7 +89,7 @@ def calibrate_target(
     enough = seen.sum(axis=1) >= FEWEST
     shape = _start(name, views, seen, enough)
     degrees = 3 * seen.sum(axis=1) - 6
-    gates = np.array([chi_square_gate(int(degree), _MISSED) if degree > 0 else 0.0 for degree in degrees])
+    gates = np.array([chi_square.gate(int(degree), _MISSED) if degree > 0 else 0.0 for degree in degrees])
     costs, used = np.full(count, np.inf), np.zeros(count, dtype=bool)
     for _ in range(_ITERATIONS):
         costs[enough] = _costs(shape, views[enough], seen[enough], weights[enough])
@@ -343,7 +343,7 @@ def _costs(shape: FloatArray, views: FloatArray, seen: BoolArray, weights: Float
 
 def _robust_unit(costs: FloatArray, degrees: IntArray) -> float:
     """The variance of a coordinate, from the median of the views' costs."""
-    medians = np.array([chi_square_gate(int(degree), 0.5) for degree in degrees])
+    medians = np.array([chi_square.gate(int(degree), 0.5) for degree in degrees])
     return float(np.median(costs / medians))
 
 

@@ -9,18 +9,19 @@ from typing import Final
 
 import numpy as np
 
+from body_tracking.core import chi_square
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
 from body_tracking.markers.interpretation import MAX_CHANCE, Candidate, decide, expected_by_chance, fitted_together
 from body_tracking.markers.observations import Points, TargetPose
-from body_tracking.markers.pose import FEWEST, chi_square_gate
+from body_tracking.markers.pose import FEWEST
 from body_tracking.markers.recognition import Recogniser, check_points, target_pose
 from body_tracking.markers.search import Deadline, DeadlineError, Pairs, near_pairs
 from body_tracking.markers.targets import Target
 from body_tracking.markers.track import Motion as Motion
 from body_tracking.markers.track import Track
 
-_INNOVATION_GATE: Final = chi_square_gate(6, 1e-6)
+_INNOVATION_GATE: Final = chi_square.gate(6, 1e-6)
 """Largest squared Mahalanobis distance of a pose from its prediction."""
 
 
