@@ -49,7 +49,7 @@ class LeanExecutor(SingleThreadedExecutor):
     """
 
     def __init__(self, node: BatchNode) -> None:
-        super().__init__()
+        super().__init__(context=node.context)
         self._batch_done = node.guarded("messages", node.batch_done)
         self._changed = True
         self._stopped = False

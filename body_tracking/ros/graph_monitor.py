@@ -11,7 +11,7 @@ from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
@@ -28,6 +28,7 @@ from body_tracking.pipeline import graph
 from body_tracking.pipeline.roles import ROLES, role_of
 from body_tracking.pipeline.system import Options
 from body_tracking.ros.bag_topics import to_profile
+from body_tracking.ros.executor import BatchNode, LeanExecutor
 
 _CHAIN = ("skeleton_filter", "joint_angles")
 _OWN_PART = ("calibration", "robot_commands")
@@ -93,19 +94,18 @@ class GraphMonitor:
         rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         self._namespace = namespace
         # the time in the name shows which of two is older
-        self._node = rclpy.create_node(f"{graph.UP_NODE}_{time.time_ns()}", namespace=namespace, context=self._context)
+        self._node = BatchNode(f"{graph.UP_NODE}_{time.time_ns()}", namespace=namespace, context=self._context)
         self._node.create_subscription(
             DiagnosticArray, graph.DIAGNOSTICS_TOPIC, self._on_diagnostics, to_profile(RELIABLE)
         )
         for topic in self._angles_topics:
-            # a deep queue, so that all are counted
+            # a deep queue, so that all are counted, and as bytes, which nobody reads
             name, qos = names.relative(topic), to_profile(graph.RELIABLE_SKELETON)
-            self._node.create_subscription(JointState, name, self._on_angles, qos)
+            self._node.create_subscription(JointState, name, self._on_angles, qos, raw=True)
         clock_qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         self._node.create_subscription(Clock, graph.CLOCK_TOPIC, self._on_clock, clock_qos)
         self._node.create_service(Trigger, graph.END, self._on_end)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
+        self._executor = LeanExecutor(self._node)
         self._thread = threading.Thread(target=self._spin, daemon=True)
         self._thread.start()
 
