@@ -45,7 +45,7 @@ def commands(page: Path) -> list[str]:
 
 ALONE = {"troubleshooting": pytest.mark.alone}
 """doctor reports problems on a machine with other load."""
-SLOW = dict.fromkeys(("reading_uncertainty", "choosing_a_filter", "markers"), pytest.mark.slow)
+SLOW = dict.fromkeys(("reading_uncertainty", "recordings", "choosing_a_filter", "markers"), pytest.mark.slow)
 """Most of their commands are also those of the README, or they compute on images for long."""
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any
+from typing import Any, Final
+
+import numpy as np
 
 from body_tracking.core.parameters import Value, fields_of, parameters_from
 from body_tracking.core.qos import LATCHED
-from body_tracking.core.skeleton import Skeleton
+from body_tracking.core.skeleton import NANOSECONDS, Joint, Skeleton
 from body_tracking.fusion.fusion import FusionParameters
 from body_tracking.fusion.people_fusion import PeopleFusion
 from body_tracking.messages.codecs import Clock, Pose, Skeletons
@@ -23,6 +26,13 @@ from body_tracking.pipeline.shared import (
     skeleton_qos,
 )
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
+
+_MEMORY: Final = 5.0
+"""Seconds over which the direction of the trunk is averaged."""
+_LONGEST: Final = 0.1
+"""Seconds for which one frame counts at most."""
+_UPSIDE_DOWN: Final = -0.5
+"""Mean vertical component of the trunk's direction below which axes must be wrong: nobody bends as far for so long."""
 
 
 def calibration_inputs(sensors: int, waiting: int = 0) -> tuple[Port, ...]:
@@ -56,6 +66,7 @@ class FusionStage(Stage):
         self._sensors = {graph.skeleton_topic(sensor): sensor for sensor in sensors}
         self.inputs = (*calibration_inputs(len(sensors)), *(skeleton_input(topic, values) for topic in self._sensors))
         self.outputs = (Port(graph.FUSED, Skeletons(), skeleton_qos(values), measured=True),)
+        self._trunk_up, self._trunk_ns = 0.0, 0
 
     def change(self, values: Mapping[str, Value]) -> None:
         """From the next frame on."""
@@ -68,11 +79,11 @@ class FusionStage(Stage):
         elif topic == graph.CALIBRATION:
             self.fusion.set_pose(payload)
         elif any(skeleton.valid.any() for skeleton in payload):
-            return _published(self.fusion.push(self._sensors[topic], payload, now.steady_ns))
+            return self._published(self.fusion.push(self._sensors[topic], payload, now.steady_ns))
         return ()
 
     def poll(self, steady_ns: int) -> Iterable[Output]:
-        return _published(self.fusion.poll(steady_ns))
+        return self._published(self.fusion.poll(steady_ns))
 
     @property
     def deadline_ns(self) -> int | None:
@@ -81,14 +92,32 @@ class FusionStage(Stage):
     def reset(self, topic: str) -> None:
         """Poses and clocks stay."""
         self.fusion.reset()
+        self._trunk_up, self._trunk_ns = 0.0, 0
 
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
-        return 0, "", dict(self.fusion.counters)
+        if self._trunk_up > _UPSIDE_DOWN:
+            return 0, "", dict(self.fusion.counters)
+        text = (
+            f"the person is upside down in {self.fusion.world}: are the axes of the skeletons those of an optical "
+            "frame (x right, y down, z forward), and is calibration's reference_roll right?"
+        )
+        return 1, text, dict(self.fusion.counters)
 
     @property
     def counters(self) -> Mapping[str, int]:
         return self.fusion.counters
 
+    def _published(self, fused: Iterable[tuple[Skeleton, ...]]) -> Iterator[Output]:
+        for skeletons in fused:
+            self._watch(skeletons[0])
+            yield Output(graph.FUSED, skeletons, skeletons[0].stamp_ns)
 
-def _published(fused: Iterable[tuple[Skeleton, ...]]) -> Iterator[Output]:
-    return (Output(graph.FUSED, skeletons, skeletons[0].stamp_ns) for skeletons in fused)
+    def _watch(self, skeleton: Skeleton) -> None:
+        """Average how far up the trunk points."""
+        trunk = skeleton.positions[Joint.SPINE_SHOULDER] - skeleton.positions[Joint.SPINE_BASE]
+        length = float(np.linalg.norm(trunk))
+        if not length > 0.0:  # nor where a joint is NaN
+            return
+        elapsed = min(max(skeleton.stamp_ns - self._trunk_ns, 0) / NANOSECONDS, _LONGEST)
+        self._trunk_ns = skeleton.stamp_ns
+        self._trunk_up += -math.expm1(-elapsed / _MEMORY) * (float(trunk[2]) / length - self._trunk_up)

@@ -135,7 +135,7 @@ class ReplayReport:
         recording_s: length of the recording by its log times.
         elapsed_s: computing time.
         counters: of events and unusable messages.
-        warnings: missing or damaged parts of the bag.
+        warnings: missing or damaged parts of the bag, and what nodes would report at its end.
     """
 
     frames: int
@@ -268,10 +268,11 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
         for stage in stages:
             counters.update({f"{stage.NAME} {name}": count for name, count in stage.counters.items()})
         counters |= Counter(written.counters)  # both halves may have counted the same message
+        states = {stage.NAME: stage.state(bag.end_ns)[:2] for stage in stages}
+        problems = [f"{name}: {text}" for name, (level, text) in states.items() if level and text]
         if not written.frames:
             given = ", ".join(settings.sensors or sources)
-            states = [stage.state(bag.end_ns) for stage in stages]
-            said = "; ".join(text for level, text, _ in states if level and text) or _listed(+counters)
+            said = "; ".join(problems) or _listed(+counters)
             raise ReplayError(f"{bag_path}: no frame of {given} came through ({said})")
         return ReplayReport(
             written.frames,
@@ -280,7 +281,7 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
             (bag.end_ns - bag.start_ns) / NANOSECONDS,
             time.perf_counter() - began,
             {name: count for name, count in sorted(counters.items()) if count},
-            tuple(bag.warnings),
+            (*bag.warnings, *problems),
         )
 
 

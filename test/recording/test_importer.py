@@ -82,6 +82,12 @@ def test_the_real_states_are_imported_as_they_are(shared_data, tmp_path):
         assert body.states.tolist() == [int(row[f"{joint}_state"]) for joint in JOINT_NAMES]
 
 
+def test_the_example_is_imported_without_a_remark(tmp_path):
+    report = import_files([Path(__file__).parents[2] / "examples" / "recording.csv.gz"], tmp_path / "bag")
+    assert {name: each.frames for name, each in report.sensors.items()} == {"kinect1": 330, "kinect2": 329}
+    assert not report.problems and not report.warnings
+
+
 def test_several_views_are_one_bag_in_time_order(tmp_path):
     files = [write_ntu(tmp_path / f"S001C00{camera}P003R001A010.skeleton", 10) for camera in (1, 2, 3)]
     report = import_files(files, tmp_path / "bag")

@@ -1,0 +1,46 @@
+"""Skeletons whose axes are wrong show a person who stands on the head, with angles that look known."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from two_kinects import FRAME, POSES
+
+from body_tracking.core.parameters import check_all
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Skeleton
+from body_tracking.fusion.stage import FusionStage
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.stage import Now
+from walkers import walk
+
+TIMES: Final = np.arange(0.0, 6.0, FRAME)
+
+
+def state_after(positions: FloatArray) -> tuple[int, str]:
+    """Level and text of the fusion after one sensor's positions at ``TIMES``."""
+    stage = FusionStage(check_all(FusionStage.PARAMETERS, {"sensors": ("kinect1",)}))
+    list(stage.take(graph.CALIBRATION, POSES["kinect1"], Now(0, 0)))
+    for time, points in zip(TIMES, positions, strict=True):
+        stamp_ns = NANOSECONDS + round(time * NANOSECONDS)
+        skeleton = Skeleton(stamp_ns, "kinect1_optical_frame", points, np.full(25, 2, np.uint8))
+        list(stage.take(graph.skeleton_topic("kinect1"), [skeleton], Now(stamp_ns, stamp_ns)))
+        list(stage.poll(stamp_ns))
+    return stage.state(0)[:2]
+
+
+@pytest.mark.parametrize("axes", [(1.0, -1.0, 1.0), (-1.0, -1.0, 1.0)])
+def test_a_person_upside_down_is_reported(axes: tuple[float, float, float]) -> None:
+    level, text = state_after(walk(TIMES) * np.array(axes))
+    assert level == 1
+    assert text.startswith("the person is upside down in world: are the axes")
+
+
+def test_a_person_who_walks_or_bends_down_is_not() -> None:
+    assert state_after(walk(TIMES)) == (0, "")
+    turn = Rotation.from_euler("x", 110.0, degrees=True)  # the head is lower than the hips
+    points = walk(TIMES)
+    bent = turn.apply((points - points[:, :1]).reshape(-1, 3)).reshape(points.shape) + points[:, :1]
+    assert state_after(bent) == (0, "")
