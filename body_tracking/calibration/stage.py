@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
+
+import numpy as np
 
 from body_tracking.calibration.online import CalibrationParameters, CalibrationUpdate, OnlineCalibration
 from body_tracking.calibration.storage import load, save
 from body_tracking.core.names import TF_STATIC
 from body_tracking.core.parameters import Parameter, Value, fields_of, parameters_from
 from body_tracking.core.qos import LATCHED, Qos
+from body_tracking.core.skeleton import Joint, Skeleton
 from body_tracking.messages.codecs import Clock, Pose, Poses, SensorClock
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.people import SubjectSelector
 from body_tracking.pipeline.shared import REFERENCE, RELIABLE, SENSORS, WORLD_FRAME, sensors_of, skeleton_input
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
 
+_TRUNKS: Final = (0.1, 1.0)
+"""Metres: least and greatest distance of SPINE_BASE and SPINE_SHOULDER, 0.5 in an adult."""
+_ODD_FRAMES: Final = 30
+"""Frames in a row with another distance from which on it is reported: an outlier lasts less."""
 _LEVEL = "world would tilt or move under everyone who uses it"
 _FIXED = {
     "method": "what one method has estimated is no start for the other",
@@ -66,6 +74,8 @@ class CalibrationStage(Stage):
             self.calibration.load(load(self._file))
         self._unsaved = False
         self._subjects = {sensor: SubjectSelector() for sensor in sensors}
+        self._odd: Counter[str] = Counter()
+        self._sizes: dict[str, float] = {}
         self._sensors = {graph.skeleton_topic(sensor): sensor for sensor in sensors}
         self.inputs = tuple(skeleton_input(topic, values) for topic in self._sensors)
         world = str(values["world_frame"])
@@ -91,6 +101,8 @@ class CalibrationStage(Stage):
 
     def take(self, topic: str, payload: Any, now: Now) -> Iterable[Output]:
         sensor = self._sensors[topic]
+        for skeleton in payload[:1]:
+            self._check_size(sensor, skeleton)
         subject = self._subjects[sensor].pick(payload)
         if subject is None:
             return ()
@@ -116,8 +128,22 @@ class CalibrationStage(Stage):
         for subject in self._subjects.values():
             subject.reset()
 
+    def _check_size(self, sensor: str, skeleton: Skeleton) -> None:
+        """Count the frames in a row in which a person has an impossible size."""
+        length = float(np.linalg.norm(np.subtract(*skeleton.positions[[Joint.SPINE_SHOULDER, Joint.SPINE_BASE]])))
+        if length > 0.0:  # not NaN
+            odd = not _TRUNKS[0] < length < _TRUNKS[1]
+            self._odd[sensor] = self._odd[sensor] + 1 if odd else 0
+            self._sizes[sensor] = length
+
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
-        return self.calibration.status()
+        level, text, values = self.calibration.status()
+        odd = [
+            f"{sensor}: a trunk of {self._sizes[sensor]:.3g} m, coordinates must be metres"
+            for sensor, count in self._odd.items()
+            if count >= _ODD_FRAMES
+        ]
+        return (1, "; ".join((*odd, text)), values) if odd else (level, text, values)
 
     def save(self) -> None:
         """Write the file, if anything changed."""
