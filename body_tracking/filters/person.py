@@ -158,7 +158,7 @@ class PersonFilter:
             counters |= {f"association {name}": count for name, count in self.people.counts.items()}
         if self._model_filter is not None:
             counters["predicted frames"] = self._predicted
-            counters["frames overtaken by predictions"] = self._overtaken
+            counters["frames that count in the next estimate"] = self._overtaken
         return counters
 
     def set_pose(self, pose: SensorPose) -> None:
@@ -367,11 +367,12 @@ class PersonFilter:
     def _send(self, skeleton: Skeleton | None, estimate: ModelEstimate) -> None:
         """Publish an estimate and its skeleton; None for the filter's current one.
 
-        Stamps never go back: a frame that comes after a prediction of a later time counts in the next estimate.
+        Stamps increase, as receivers of transforms need it: a frame that comes after an estimate of its time, or after
+        a prediction of a later one, counts in the next estimate.
         """
         assert self._model_filter is not None
         last_ns = self._published_ns
-        if last_ns is not None and estimate.stamp_ns < last_ns and not jumped_back(estimate.stamp_ns, last_ns):
+        if last_ns is not None and estimate.stamp_ns <= last_ns and not jumped_back(estimate.stamp_ns, last_ns):
             self._overtaken += 1
             return
         self._published_ns = estimate.stamp_ns

@@ -230,6 +230,21 @@ def test_no_prediction_for_a_time_with_waiting_frames(events: list[Event]) -> No
 
 
 @pytest.mark.parametrize("lag", [0.0, 0.15])
+def test_frames_of_one_instant_give_one_output(events: list[Event], lag: float) -> None:
+    """A receiver of transforms ignores a second one of the same time, with a warning."""
+    period_ns = NANOSECONDS // 20
+    together = []
+    for now_ns, sensor, skeleton in events[:160]:
+        stamp_ns = skeleton.stamp_ns // period_ns * period_ns
+        together.append((now_ns, sensor, replace(skeleton, stamp_ns=stamp_ns)))
+    stage, published, _ = staged(together, lag=lag)
+    stage.flush()
+    stamps = [stamp_ns for topic, stamp_ns in published if topic == graph.MODEL_STATE]
+    assert len(stamps) > 20 and stamps == sorted(set(stamps))
+    assert stage.counters["frames"] > 1.5 * len(stamps)
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.15])
 def test_orientations_alone_are_published_at_the_rate_of_predicted_frames(lag: float) -> None:
     rng = np.random.default_rng(4)
     person, motion = RandomPerson.draw(rng), RandomMotion(rng, 3.0)
