@@ -268,8 +268,8 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
         for stage in stages:
             counters.update({f"{stage.NAME} {name}": count for name, count in stage.counters.items()})
         counters |= Counter(written.counters)  # both halves may have counted the same message
-        states = {stage.NAME: stage.state(bag.end_ns)[:2] for stage in stages}
-        problems = [f"{name}: {text}" for name, (level, text) in states.items() if level and text]
+        states = [stage.state(bag.end_ns) for stage in stages]
+        problems = [text for level, text, _ in states if level and text]
         if not written.frames:
             given = ", ".join(settings.sensors or sources)
             said = "; ".join(problems) or _listed(+counters)
