@@ -54,6 +54,7 @@ def test_messages_that_a_node_did_not_process_are_reported_where_they_are_many()
         "marker_detector": status(received=82, **{"lost /left/image_raw": 89, "dropped /right/image_raw": 4}),
         "fusion": status(received=1000, **{"lost /kinect1/skeleton": 9}),
         "bag_recorder": status(received=1000, lost=0),
+        "viewer": status(received=100, **{"lost /kinect1/skeleton": 1000}),  # shows what is newest
     }
     text = "messages not processed (machine or network too slow): marker_detector 93"
     assert losses_part(found) == [text]

@@ -35,6 +35,8 @@ _OWN_PART = ("calibration", "robot_commands")
 """Nodes that have a part of their own in the status line."""
 _LOSSES = ("dropped ", "lost ", "left out after a standstill ")
 """Beginnings of the keys, before the topic, by which a node counts messages that it did not process."""
+_SHOWING = ("viewer", "body_markers")
+"""Nodes that show the latest messages: others are left out as they should be."""
 _NOTABLE_LOSS = 0.01
 """Share of a node's received messages."""
 _FRESH = 3.0
@@ -65,6 +67,8 @@ def losses_part(statuses: Mapping[str, NodeStatus]) -> list[str]:
     """The messages that nodes did not process, where they are more than one in a hundred received ones."""
     found = []
     for name, status in sorted(statuses.items()):
+        if name in _SHOWING:
+            continue
         counts = [status.number(key) or 0.0 for key in status.values if key.startswith(_LOSSES)]
         if sum(counts) > _NOTABLE_LOSS * (status.number("received") or 0.0):
             found.append(f"{name} {sum(counts):.0f}")
