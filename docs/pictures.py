@@ -192,7 +192,8 @@ def panel(axes: Axes, name: str, convention: str) -> None:
     flat = np.stack([track[:, farthest] @ right, track[:, farthest] @ up], axis=-1)
     axes.plot(*flat[:-1].T, color=RED, linewidth=1.6, zorder=4)
     axes.annotate("", flat[-1], flat[-2], arrowprops={"arrowstyle": "-|>", "color": RED, "lw": 1.6}, zorder=5)
-    axes.set_title(name.removesuffix("_left").replace("_", " "), fontsize=9, fontweight="bold", pad=3)
+    own = name if name.startswith("thorax") else name.removesuffix("_left")  # of the trunk it is a direction
+    axes.set_title(own.replace("_", " "), fontsize=9, fontweight="bold", pad=3)
     seen = np.concatenate([track[0][list(joints)], track[-1][list(joints)]]) @ np.stack([right, up], axis=1)
     middle = 0.5 * (seen.min(axis=0) + seen.max(axis=0))
     half = float((1.3 * (0.5 * np.ptp(seen, axis=0) + 0.03) * (1.0, 1.0 / SHAPE)).max())

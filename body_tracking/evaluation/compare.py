@@ -109,11 +109,10 @@ def report_of(sides: Mapping[str, Side]) -> Report:
             facts.append(("note", f"{one} and {other} are not compared: {error}"))
     names = tuple(sides)
     seconds = max(_seconds(side) for side in sides.values())
+    about = _PAIRS + (_TARGETS if any(isinstance(side, MarkerReference) for side in sides.values()) else "")
     facts = [*((name, f"{side.source}, {_seconds(side):.1f} s") for name, side in sides.items()), *facts]
     tables = [
-        Table(
-            "differences", "RMS difference", names, _matrix(names, pairs, "measured", "deg", np.degrees(1.0)), _PAIRS
-        ),
+        Table("differences", "RMS difference", names, _matrix(names, pairs, "measured", "deg", np.degrees(1.0)), about),
         Table("covered", "in 95%", names, _matrix(names, pairs, "covered", "%", 100.0), _COVERED),
     ]
     order = [name for side in sides.values() if isinstance(side, EstimatedSegments) for name in side.angles.names]
@@ -132,8 +131,9 @@ def report_of(sides: Mapping[str, Side]) -> Report:
     return Report("systems against each other", tuple(facts), content, tuple(tables))
 
 
-_PAIRS = (
-    "of all angles that both know. The mountings of infrared targets are fitted to the other half of the recording; "
+_PAIRS = "of all angles that both know."
+_TARGETS = (
+    " The mountings of infrared targets are fitted to the other half of the recording; "
     "constant\ndifferences do not show in their rows and columns."
 )
 _COVERED = "share of the differences within 1.96 of the deviation that both state together; 95 where these are true."

@@ -234,9 +234,9 @@ def _notes(estimate: Recorded, truth: Recorded) -> list[str]:
             f"no joint is known in both: {estimate.source} knows {_joints(mine)}, {truth.source} {_joints(theirs)}"
         )
     notes = list(dict.fromkeys((*estimate.warnings, *truth.warnings)))
-    for only, where in ((mine & ~theirs, estimate), (theirs & ~mine, truth)):
+    for only, where in ((mine & ~theirs, "estimate"), (theirs & ~mine, "truth")):
         if only.any():
-            notes.append(f"not compared, since only the recording {where.source} has these joints: {_joints(only)}")
+            notes.append(f"not compared, since only the {where} has these joints: {_joints(only)}")
     for each in (estimate, truth):
         missing = ~known(each.positions[:, mine & theirs])
         if missing.any():

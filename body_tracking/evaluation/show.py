@@ -47,7 +47,7 @@ def summary(angles: AngleSeries, truth: AngleSeries | None = None) -> Table:
     if are_fine(angles):
         columns = [each._replace(digits=3) if each.unit == "deg" else each for each in columns]
     note = "stddev: median" + (", inf if unknown in most frames" if np.isinf(columns[3].values).any() else "")
-    note += ". finite: share of the frames with an angle, however large its stddev."
+    note += ". final: the last one that is known. finite: share of the frames with an angle, however large its stddev."
     if np.isfinite(error).any():
         note += (
             "\nFrom true min on: of frames with a truth, errors where an angle is known in 2 % of the frames or more. "

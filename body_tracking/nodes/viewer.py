@@ -49,6 +49,7 @@ from body_tracking.ros.node import STEADY, GraphNode
 from body_tracking.ros.wire import WIRE, deserialized
 from body_tracking.viewing.curves import AngleHistory
 from body_tracking.viewing.snapshot import PageError, Seen, Snapshot, SystemView
+from body_tracking.viewing.status import FRESH
 
 PARAMETERS = (
     Parameter(
@@ -299,12 +300,21 @@ class ViewerNode(GraphNode):
                 people.update({each.body: (each, received) for each in skeletons})
                 for body in [body for body, (_, since) in people.items() if received - since > _TOGETHER_S]:
                     del people[body]
-        return Seen(tuple(each for each, _ in people.values()), time.monotonic() - received > _STALE_S)
+        return Seen(tuple(each for each, _ in people.values()), self.is_old(received))
+
+    def is_old(self, received: float) -> bool:
+        """Whether what was received at a steady time is old; while a bag stands still, nothing becomes old."""
+        return time.monotonic() - received > _STALE_S and not self.bag_is("paused", "at the end")
+
+    def bag_is(self, *states: str) -> bool:
+        """Whether a player reports one of these states."""
+        player = self.statuses.get("bag_player")
+        return player is not None and player.text in states and time.monotonic() - player.received <= FRESH
 
     def segments(self) -> tuple[FloatArray, FloatArray]:
         """(n, 3) origins and (n, 4) quaternions of the model's segments; none where the filter has no model."""
         cdr, received = self.latest.get(graph.segments_topic(self.body), (b"", -np.inf))
-        if time.monotonic() - received > _STALE_S:
+        if not cdr or self.is_old(received):
             return np.empty((0, 3)), np.empty((0, 4))
         try:
             return joint_state_to_segments(deserialized(cdr, MultiDOFJointState))[1:]
@@ -315,7 +325,7 @@ class ViewerNode(GraphNode):
     def payload(self, topic: str) -> Any:
         """The latest message of a layer's topic; None where it is absent or old."""
         cdr, received = self.latest.get(topic, (b"", -np.inf))
-        return None if time.monotonic() - received > _STALE_S else self.decoded(topic, cdr)
+        return None if not cdr or self.is_old(received) else self.decoded(topic, cdr)
 
     def decoded(self, topic: str, cdr: bytes) -> Any:
         """The payload of a message of a layer or a view; None for one that is malformed."""
@@ -369,7 +379,7 @@ class ViewerNode(GraphNode):
         self.seeks += 1
         # an unchanged parameter is not applied, although the bag has gone on meanwhile: alternate by a microsecond
         self.set_parameters_of("bag_player", position=place_s + 1e-6 * (self.seeks % 2))
-        return f"plays on from {place_s:.1f} s"
+        return f"{'paused: resume ' if self.bag_is('paused') else ''}plays on from {place_s:.1f} s"
 
     def loop(self, on: bool) -> str:
         """Play the bag again at its end, or not."""

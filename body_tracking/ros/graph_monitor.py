@@ -179,6 +179,8 @@ class GraphMonitor:
         player = fresh.get("bag_player")
         if player is not None:
             parts[0] += f" (bag {float(player.values['position s']):.1f}/{float(player.values['duration s']):.1f} s)"
+        elif options["bag"] and not self.clock_ns:
+            parts[0] += " (the bag plays once all nodes have started)"
         parts.append(self._rates(options, fresh))
         delay = self._delay(options, fresh)
         if delay:

@@ -128,7 +128,7 @@ def test_gaps_of_the_truth_are_reported_and_not_filled() -> None:
     assert frames[Joint.WRIST_LEFT] == pytest.approx(120 - 30, abs=1)
     assert result.comparisons[0].joints.farthest[Joint.WRIST_LEFT] < 1e-3
     said = "\n".join(result.notes)
-    assert "not compared, since only the recording mine has these joints: Head" in said
+    assert "not compared, since only the estimate has these joints: Head" in said
     assert "60 of 250 frames" in said
 
 
