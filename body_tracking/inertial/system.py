@@ -61,7 +61,9 @@ SYSTEM = System(
         Option(
             "imus",
             (),
-            "a segment with an inertial sensor, in the form of the parameter segments of imu_skeleton; may be repeated",
+            "a segment with an inertial sensor, and the sensor's name in its topics if it is not the segment's: "
+            "pelvis, lower_trunk, upper_trunk, head, or clavicle, upper_arm, forearm, hand with _left or _right; "
+            "may be repeated",
             "SEGMENT[:NAME]",
             parameter=("imu_skeleton", "segments"),
             example=graph.EXAMPLE_IMUS,
