@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections import Counter
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
-
-import numpy as np
 
 from body_tracking.calibration.online import CalibrationParameters, CalibrationUpdate, OnlineCalibration
 from body_tracking.calibration.storage import load, save
@@ -74,8 +72,8 @@ class CalibrationStage(Stage):
             self.calibration.load(load(self._file))
         self._unsaved = False
         self._subjects = {sensor: SubjectSelector() for sensor in sensors}
-        self._odd: Counter[str] = Counter()
-        self._sizes: dict[str, float] = {}
+        self._odd: dict[str, tuple[int, float]] = {}
+        """Frames in a row with an impossible trunk, and its last length, metres."""
         self._sensors = {graph.skeleton_topic(sensor): sensor for sensor in sensors}
         self.inputs = tuple(skeleton_input(topic, values) for topic in self._sensors)
         world = str(values["world_frame"])
@@ -130,17 +128,18 @@ class CalibrationStage(Stage):
 
     def _check_size(self, sensor: str, skeleton: Skeleton) -> None:
         """Count the frames in a row in which a person has an impossible size."""
-        length = float(np.linalg.norm(np.subtract(*skeleton.positions[[Joint.SPINE_SHOULDER, Joint.SPINE_BASE]])))
-        if length > 0.0:  # not NaN
-            odd = not _TRUNKS[0] < length < _TRUNKS[1]
-            self._odd[sensor] = self._odd[sensor] + 1 if odd else 0
-            self._sizes[sensor] = length
+        upper, lower = skeleton.positions[[Joint.SPINE_SHOULDER, Joint.SPINE_BASE]]
+        length = math.dist(upper, lower)
+        if _TRUNKS[0] < length < _TRUNKS[1]:
+            self._odd.pop(sensor, None)
+        elif 0.0 < length < math.inf:  # nor NaN, nor zeros in place of joints
+            self._odd[sensor] = self._odd.get(sensor, (0, 0.0))[0] + 1, length
 
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
         level, text, values = self.calibration.status()
         odd = [
-            f"{sensor}: a trunk of {self._sizes[sensor]:.3g} m, coordinates must be metres"
-            for sensor, count in self._odd.items()
+            f"{sensor}: a trunk of {length:.3g} m, coordinates must be metres"
+            for sensor, (count, length) in self._odd.items()
             if count >= _ODD_FRAMES
         ]
         return (1, "; ".join((*odd, text)), values) if odd else (level, text, values)

@@ -36,7 +36,7 @@ _OWN_PART = ("calibration", "robot_commands")
 _LOSSES = ("dropped ", "lost ", "left out after a standstill ")
 """Beginnings of the keys, before the topic, by which a node counts messages that it did not process."""
 _SHOWING = ("viewer", "body_markers")
-"""Nodes that show the latest messages: others are left out as they should be."""
+"""Nodes that show the latest messages, and leave out others on purpose."""
 _NOTABLE_LOSS = 0.01
 """Share of a node's received messages."""
 _FRESH = 3.0
