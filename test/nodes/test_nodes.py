@@ -383,6 +383,10 @@ class Stuck(node.GraphNode):
     NAME = "stuck"
     PARAMETERS = (RELIABLE,)
 
+    def __init__(self):
+        super().__init__()
+        print("here", flush=True)  # signals are handled from before this
+
     def close(self):
         print("closed", flush=True)
 
@@ -390,7 +394,6 @@ class Stuck(node.GraphNode):
         ctypes.PyDLL(None).sleep(60)  # keeps the interpreter's lock, as rclpy does
 
 main._LEAVE_S = 1.0
-print("here", flush=True)
 main.run(Stuck)
 """
 
