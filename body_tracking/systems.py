@@ -101,27 +101,31 @@ def options_of(**given: Value) -> Options:
 
 
 def add_options(parser: argparse.ArgumentParser, *names: str, **texts: str) -> None:
-    """Add options to a command.
+    """Add options to a command, in groups under the headings of their systems.
 
     Args:
         parser: of the command.
         names: of the options; all but the hidden ones when empty.
         texts: help texts that replace those of the options.
     """
-    for option in OPTIONS.values():
+    groups: dict[str, argparse._ArgumentGroup] = {}
+    for system, option in [(each, option) for each in SYSTEMS for option in each.options]:
         if option.hidden or (names and option.name not in names):
             continue
+        if system.heading not in groups:
+            groups[system.heading] = parser.add_argument_group(system.heading)
+        group = groups[system.heading]
         flag, text = f"--{option.name.replace('_', '-')}", texts.get(option.name, option.text)
         if isinstance(option.default, bool):
-            parser.add_argument(flag, action="store_true", help=text)
+            group.add_argument(flag, action="store_true", help=text)
         elif isinstance(option.default, tuple) and option.name != "sensors":
-            parser.add_argument(flag, action="append", metavar=option.metavar, help=text)
+            group.add_argument(flag, action="append", metavar=option.metavar, help=text)
         else:
             kind = Path if option.path else str if isinstance(option.default, tuple) else type(option.default)
             choices = None if option.choices is None else tuple(option.choices())
             metavar = option.metavar or None
             default = option.default if isinstance(option.default, int | float) else None
-            parser.add_argument(flag, type=kind, choices=choices, metavar=metavar, default=default, help=text)
+            group.add_argument(flag, type=kind, choices=choices, metavar=metavar, default=default, help=text)
 
 
 def options_from(args: argparse.Namespace) -> dict[str, Value]:

@@ -46,7 +46,7 @@ def test_without_a_command_it_says_what_to_do_next(nobody: Path, capsys: pytest.
     (nobody / "bags").mkdir()
     (nobody / "bags" / "mine").symlink_to(ROOT / "bags" / "tpose_wave")
     text = said()
-    assert "Recordings in this folder: mine." in text
+    assert "Recordings in this folder: bags/mine." in text
     assert "  body_tracking up --bag bags/mine" in text and "  body_tracking replay bags/mine -o mine_angles" in text
     (nobody / "lab.yaml").write_text("kinect1_skeleton: {ros__parameters: {backend: network}}")
     assert "  body_tracking up --params-file lab.yaml" in said()

@@ -122,6 +122,7 @@ def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
 
 SYSTEM = System(
     "camera",
+    heading="cameras with colour images",
     order=1,
     nodes=(
         NodeType(

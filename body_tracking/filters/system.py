@@ -54,6 +54,7 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
 
 SYSTEM = System(
     "filters",
+    heading="filter and joint angles",
     order=2,
     nodes=(
         NodeType(

@@ -45,6 +45,7 @@ def _finds(topics: Mapping[str, str]) -> dict[str, Value]:
 
 SYSTEM = System(
     "inertial",
+    heading="inertial sensors (IMUs)",
     order=1,
     nodes=(
         NodeType(

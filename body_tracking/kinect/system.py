@@ -113,6 +113,7 @@ def _adapted(options: Options) -> dict[str, dict[str, Value]]:
 
 SYSTEM = System(
     "kinect",
+    heading="skeletons, calibration and people",
     order=0,
     nodes=(
         NodeType("kinect_skeleton", Place.SOURCE, basic=("backend", "file", "address", "port", "key_file")),

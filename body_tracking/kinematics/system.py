@@ -46,6 +46,7 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
 
 SYSTEM = System(
     "kinematics",
+    heading="filter and joint angles",
     order=3,
     nodes=(
         NodeType(

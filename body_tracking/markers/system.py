@@ -84,6 +84,7 @@ def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
 
 SYSTEM = System(
     "markers",
+    heading="infrared markers",
     order=1,
     nodes=(
         NodeType(

@@ -74,6 +74,7 @@ def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
 
 SYSTEM = System(
     "mesh",
+    heading="depth cameras",
     order=1,
     nodes=(NodeType("mesh_tracker", Place.IMAGES, "body_tracking.mesh.stage:MeshStage", basic=("person",)),),
     specs=_specs,

@@ -202,6 +202,7 @@ class System:
 
     Attributes:
         name: of the system.
+        heading: over its options in the help of commands.
         order: among the systems, in tables.
         nodes: its executables.
         specs: returns the nodes that it runs for given options, without their namespace.
@@ -216,6 +217,7 @@ class System:
     """
 
     name: str
+    heading: str = "more"
     order: int = 100
     nodes: tuple[NodeType, ...] = ()
     specs: Callable[[Options], Iterable[NodeSpec]] = lambda options: ()

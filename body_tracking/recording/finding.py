@@ -102,11 +102,16 @@ def is_bag(path: Path) -> bool:
 
 
 def bags_in(folder: Path) -> tuple[Path, ...]:
-    """The folder itself if it is a recording; else those in it and in its folder ``bags``, newest first."""
+    """The folder itself if it is a recording; else those in it, in its folder ``bags`` and in those of ``make demo``,
+    newest first, without those of the package.
+    """
     try:
         if is_bag(folder):
             return (folder,)
-        found = [each for place in (folder, folder / "bags") if place.is_dir() for each in place.iterdir()]
+        places = (folder, folder / "bags", *folder.glob("demo*_output"))
+        shipped = {each.parent.resolve() for each in shipped_bags()}
+        places = tuple(each for each in places if each.is_dir() and each.resolve() not in shipped)
+        found = [each for place in places for each in place.iterdir()]
         found = [each for each in found if is_bag(each)]
         return tuple(sorted(found, key=lambda each: (-each.stat().st_mtime, each.name)))
     except OSError:  # no permission to read a folder, or a bag was deleted meanwhile

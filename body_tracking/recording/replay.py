@@ -358,6 +358,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "replay",
         description="Calibrates, fuses, filters and computes joint angles offline, with the same results as the live "
         "graph, and writes every topic that the graph would publish into a new bag.",
+        epilog="Example: 'body_tracking replay BAG -o angles --filter ekf', then 'body_tracking show angles'.",
     )
     command.add_argument(
         "bag",

@@ -54,6 +54,7 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
 
 SYSTEM = System(
     "recording",
+    heading="playing and recording",
     order=5,
     nodes=(
         NodeType("bag_player", Place.SOURCE, basic=("bag", "rate", "loop", "start_offset", "topics")),

@@ -56,6 +56,7 @@ def convention_of(mapping: Path, asked: str) -> str:
 
 SYSTEM = System(
     "robot",
+    heading="robot",
     order=4,
     nodes=(NodeType("robot_commands", Place.CONSUMER, takes=_takes, basic=("mapping", "rate")),),
     specs=_specs,

@@ -79,9 +79,9 @@ def _recordings(folder: Path, page: str, *, live: bool) -> Iterator[Step]:
     if not bags:
         return
     where = "in this folder" if own else "that come with the package"
-    names = [each.name for each in bags[:_SHOWN]]
+    names = [str(_short(each, folder)) if own else each.name for each in bags[:_SHOWN]]
     more = f" and {len(bags) - _SHOWN} more" if len(bags) > _SHOWN else ""
-    first = bags[0].relative_to(folder) if bags[0] != folder and bags[0].is_relative_to(folder) else bags[0]
+    first = _short(bags[0], folder)
     commands = [f"body_tracking up --bag {first}{page}"] if live else []
     out = f"{first.stem}_angles"
     yield (
@@ -91,6 +91,10 @@ def _recordings(folder: Path, page: str, *, live: bool) -> Iterator[Step]:
             f"body_tracking replay {first} -o {out}",
         ),
     )
+
+
+def _short(bag: Path, folder: Path) -> Path:
+    return bag.relative_to(folder) if bag != folder and bag.is_relative_to(folder) else bag
 
 
 def run() -> int:

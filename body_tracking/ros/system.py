@@ -9,6 +9,7 @@ from body_tracking.pipeline.system import Command, Option, Service, System, Topi
 
 SYSTEM = System(
     "graph",
+    heading="the graph as a whole",
     order=7,
     options=(
         Option(

@@ -502,7 +502,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "fusion, filter, joint angles and, with --record, a recorder. A node that dies is started again. Ends with "
         "Ctrl-C, or when the bag ends.",
         epilog="Without sensors, --bag and --params-file it takes all that publish. A parameters file says what the "
-        "node of each sensor reads, under its name <sensor>_skeleton.",
+        "node of each sensor reads, under its name <sensor>_skeleton. Examples: 'body_tracking up --viewer' with the "
+        "sensors that publish, 'body_tracking up --bag BAG --record NEW_BAG' with a recording.",
     )
     add_options(parser)
     parser.add_argument("--log-dir", type=Path, metavar="FOLDER", help="folder for logs (default: that of ROS)")

@@ -157,14 +157,15 @@ def _absent() -> str:
 def _recordings(args: argparse.Namespace, known: dict[Path, Any]) -> Iterator[Any]:
     """The recordings of the folder, then those that come with the package, each once."""
     seen: set[Path] = set()
-    for where, bags in (("in this folder", bags_in(Path())), ("an example", shipped_bags())):
+    for own, bags in ((True, bags_in(Path())), (False, shipped_bags())):
         for bag in bags:
             path = bag.resolve()
             if path in seen:
                 continue
             seen.add(path)
             if path not in known:
-                known[path] = _described(args, bag, where)
+                place = "this folder" if bag.parent == Path() else str(bag.parent)
+                known[path] = _described(args, bag, f"in {place}" if own else "an example")
             yield known[path]
 
 

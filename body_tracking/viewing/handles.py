@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 import viser
 
-from body_tracking.core.skeleton import FloatArray, IntArray
+from body_tracking.core.skeleton import FloatArray, IntArray, Joint
 from body_tracking.viewing.colours import Colour, ColourArray, linear
 from body_tracking.viewing.shapes import figure, joint_label
 from body_tracking.viewing.snapshot import Seen
@@ -21,6 +21,8 @@ _JOINT: Final = trimesh.creation.icosphere(subdivisions=2, radius=_JOINT_RADIUS)
 origin, unscaled. A ball of a metre there caught the clicks on the legs of people behind the reference sensor."""
 TUBE: Final = trimesh.creation.cylinder(radius=1.0, height=1.0, sections=16)
 STALE: Final[Colour] = (190, 190, 190)
+_CROWDED: Final = frozenset({Joint.HAND_LEFT, Joint.THUMB_LEFT, Joint.HAND_RIGHT, Joint.THUMB_RIGHT})
+"""Joints so near to the wrist that their names would lie over its own; a click shows them."""
 
 
 class Drawn:
@@ -44,7 +46,7 @@ class Drawn:
         Args:
             seen: the skeletons.
             visible: draw them.
-            names: show the name of each joint.
+            names: show the names of the joints, but of those of a hand only the wrist's and the tip's.
         """
         drawn = figure(seen.skeletons if visible else (), self._colour)
         self._which = drawn.which
@@ -69,7 +71,8 @@ class Drawn:
 
     def _draw_names(self, joints: FloatArray, everything: bool) -> None:
         keys = [(int(place), int(number)) for place, number in self._which]
-        wanted = {key: at for key, at in zip(keys, joints, strict=True) if everything or key in self._named}
+        shown = {key for key in keys if everything and key[1] not in _CROWDED} | self._named
+        wanted = {key: at for key, at in zip(keys, joints, strict=True) if key in shown}
         for key in self._labels.keys() - wanted.keys():
             self._labels.pop(key).remove()
         for key, at in wanted.items():

@@ -241,6 +241,7 @@ class Page:
         self._clouds.draw(shapes.centres, so3.matrix_to_quat(shapes.rotations), shapes.radii)
 
     def _draw_frames(self, snapshot: Snapshot) -> None:
+        show(self._frames_box, bool(len(snapshot.origins)))
         there = len(snapshot.origins) if self.visible["frames"] else 0
         if there and len(self._axes.batched_positions) != there:
             scales, still = np.ones(there), np.tile([1.0, 0.0, 0.0, 0.0], (there, 1))
@@ -265,11 +266,12 @@ class Page:
         sensors = tuple(self._colours)
         self._panel = ControlPanel(self._server, self._controls, filters, conventions, sensors, start_page)
         self._legend = gui.add_html(self._legend_text())
+        with gui.add_folder("Show", expand_by_default=False):
+            boxes = {name: self._checkbox(name, label, shown) for name, (label, shown) in self._choices.items()}
+        self._frames_box = boxes["frames"]
+        self._frames_box.visible = False  # until a filter on a body model runs
         with gui.add_folder("Nodes"):
             self._table = gui.add_html("no diagnostics yet")
-        with gui.add_folder("Show", expand_by_default=False):
-            for name, (label, shown) in self._choices.items():
-                self._checkbox(name, label, shown)
         angles = gui.add_panel()
         with angles.add_tab("Joint angles \u00b1 95 %", viser.Icon.CHART_LINE):
             self._plots = Plots(gui, window)
@@ -285,12 +287,15 @@ class Page:
         )
         return f"<div style='font-size:0.8em;padding:0.3em 0.6em'>{dots}</div>"
 
-    def _checkbox(self, layer: str, label: str, shown: bool) -> None:
+    def _checkbox(self, layer: str, label: str, shown: bool) -> Any:
         checkbox = self._server.gui.add_checkbox(label, shown)
 
         @checkbox.on_update
         def _(event: viser.GuiEvent[Any]) -> None:
             self.visible[layer] = checkbox.value
+
+        handle: Any = checkbox
+        return handle
 
     # --- slow updates
 

@@ -25,6 +25,7 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
 
 SYSTEM = System(
     "viewing",
+    heading="pages and pictures",
     order=6,
     nodes=(
         NodeType("body_markers", Place.CONSUMER, takes=_skeletons),
