@@ -17,7 +17,9 @@ clips. And how much of the motion of the right shoulder along the trunk axis eac
 clip): the slope of its height above SpineShoulder by that above the middle of C7 and CLAV, of all clips without their
 means (1 is ideal).
 
-Angles. Elevation: upper arm against the trunk axis, 0 hanging; flexion: forearm against upper arm, 0 straight. Kinect:
+Angles. Elevation: upper arm against the trunk axis, 0 hanging; flexion: forearm against upper arm, 0 straight. Plane of
+elevation and rotation of the upper arm as in ``kinematics.positional``, compared where they exist: the arm raised by 30
+to 150 degrees by Vicon, for the rotation also the elbow bent by 40 or more (nearly all in the clips of m09). Kinect:
 the lines between the joints, trunk axis from SpineMid to SpineShoulder. Vicon: from joint centres that are computed
 from the markers. The trunk axis runs from the middle of T10 and STRN to the middle of C7 and CLAV (ISB's y axis of the
 thorax, Wu 2005, with T10 for T8 and STRN for the xiphoid process). The shoulder lies below the acromion along the trunk
@@ -72,8 +74,15 @@ HALF_ELBOW = 0.040
 """Distance of the elbow centre from its lateral marker's centre, m: half the width of an adult's elbow and marker."""
 
 ANGLES = ("elevation", "flexion")
-_NAMES = ("shoulder_elevation_right", "elbow_flexion_right")
-"""Names of the published angles."""
+PARTIAL = ("plane", "rotation")
+"""Angles that exist in some poses only."""
+RAISED, BENT = (30.0, 150.0), 40.0
+"""Elevation, and least flexion for the rotation, degrees, between and beyond which they are compared."""
+LEAST_SAMPLES = 20
+"""Of a clip in which such an angle exists, to be compared."""
+_NAMES = ("shoulder_elevation_right", "elbow_flexion_right", "shoulder_plane_right", "humeral_rotation_right")
+_ISB_NAMES = (*_NAMES[:2], "shoulder_plane_of_elevation_right", "shoulder_internal_rotation_right")
+"""Names of the published angles, positional and of ISB."""
 _EVERY = 30
 """Every thirtieth frame is used to fit the correlation: errors of consecutive frames hardly differ."""
 RAW = "raw"
@@ -128,7 +137,7 @@ class Arm:
 
     Attributes:
         times: (n,) s.
-        elevation, flexion: (n,) degrees.
+        elevation, flexion, plane, rotation: (n,) degrees.
         directions: (n, 6) unit vectors of upper arm and forearm in the thorax's axes (forward, left, up).
         height: (n,) m, of the shoulder above the thorax's upper end, along the trunk axis.
     """
@@ -136,6 +145,8 @@ class Arm:
     times: FloatArray
     elevation: FloatArray
     flexion: FloatArray
+    plane: FloatArray
+    rotation: FloatArray
     directions: FloatArray
     height: FloatArray
 
@@ -195,7 +206,24 @@ def _arm(
     directions = [np.einsum("nij,nj->ni", axes, _unit(each)) for each in (upper, forearm)]
     elevation, flexion = (np.degrees(common.between(upper, other)) for other in (-up, forearm))
     height = ((shoulder - chest) * up).sum(axis=-1)
-    return Arm(times, elevation, flexion, np.concatenate(directions, axis=1), height)
+    return Arm(times, elevation, flexion, *_plane_and_rotation(*directions), np.concatenate(directions, axis=1), height)
+
+
+def _plane_and_rotation(upper: FloatArray, forearm: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Of the right arm, (n,) degrees each, from directions in the thorax's axes (forward, left, up)."""
+    plane = np.arctan2(upper[:, 0], -upper[:, 1])
+    ahead = _unit(np.cross([0.0, 0.0, 1.0], upper))  # the forearm's direction without rotation
+    inward = np.cross(ahead, upper)
+    rotation = np.arctan2((forearm * inward).sum(axis=1), (forearm * ahead).sum(axis=1))
+    return np.degrees(plane), np.degrees(rotation)
+
+
+def _where_it_exists(angle: str, true: FloatArray, elevation: FloatArray, flexion: FloatArray) -> FloatArray:
+    """Vicon's values (n,) of a partial angle, NaN where the arm's pose does not determine it; all in degrees."""
+    there = (elevation > RAISED[0]) & (elevation < RAISED[1])
+    if angle == "rotation":
+        there &= flexion > BENT
+    return np.where(there, true, np.nan)
 
 
 def kinect_arm(skeletons: list[Skeleton]) -> Arm:
@@ -237,8 +265,8 @@ class Filtered:
 
     Attributes:
         skeletons: one per frame.
-        published: (n, 2) published elevation and flexion of the right arm, degrees.
-        stddev: (n, 2) their standard deviations, degrees.
+        published: (n, 4) published angles of the right arm: elevation, flexion, plane and rotation, degrees.
+        stddev: (n, 4) their standard deviations, degrees; infinite where unknown.
         trunk: median flexion of the trunk in the second half, degrees; NaN without a body model.
     """
 
@@ -277,13 +305,15 @@ def filtered(skeletons: list[Skeleton], name: str, of_bones: float, lag: float =
         if isinstance(chosen, ModelFilter):
             assert estimate is not None
             angles = angles_of(estimate, chosen.model, "isb", angles)
-            own = angles_of(estimate, chosen.model, "model")
-            trunk.append(np.degrees(own.position[own.names.index("trunk_flexion")]))
+            of_model = angles_of(estimate, chosen.model, "model")
+            trunk.append(np.degrees(of_model.position[of_model.names.index("trunk_flexion")]))
         else:
             angles = positional_angles(out, of_bones)
-        columns = [angles.names.index(name) for name in _NAMES]
+        names = _ISB_NAMES if isinstance(chosen, ModelFilter) else _NAMES
+        columns = [angles.names.index(name) for name in names]
         found.append(out)
-        published.append(np.abs(np.degrees(angles.position[columns])))  # ISB's elevation is negative
+        own = np.degrees(angles.position[columns])
+        published.append([abs(own[0]), *own[1:]])  # ISB's elevation is negative
         stddev.append(np.degrees(angles.position_stddev[columns]))
     bent = float(np.median(trunk[len(trunk) // 2 :])) if trunk else float("nan")
     return Filtered(found, np.array(published), np.array(stddev), bent)
@@ -388,7 +418,7 @@ def correlation_of(clips: list[Clip]) -> float:
 def _positional(skeletons: list[Skeleton], of_bones: float) -> tuple[FloatArray, FloatArray]:
     """(n, 2) the right arm's ``ANGLES``, and (n, 2) their standard deviations; degrees."""
     angles = [positional_angles(each, of_bones) for each in skeletons]
-    columns = [angles[0].names.index(name) for name in _NAMES]
+    columns = [angles[0].names.index(name) for name in _NAMES[: len(ANGLES)]]
     return tuple(
         np.degrees([getattr(each, part)[columns] for each in angles]) for part in ("position", "position_stddev")
     )  # type: ignore[return-value]
@@ -430,6 +460,21 @@ def measure(job: tuple[Clip, ArmLaw, float, Methods]) -> dict[str, Any]:
                     "coverage": float(inside[known].mean()),
                     "stddev": float(np.median(stddev[known])),
                 }
+        elevation, flexion = (sample(at, vicon.times, each) for each in (vicon.elevation, vicon.flexion))
+        for column, angle in enumerate(PARTIAL, len(ANGLES)):
+            true = _where_it_exists(angle, sample(at, vicon.times, getattr(vicon, angle)), elevation, flexion)
+            given = outputs[name].published[:, column] if name in outputs else getattr(arm, angle)
+            error = (given - true + 180.0) % 360.0 - 180.0
+            known = np.isfinite(error)
+            if known.sum() < LEAST_SAMPLES:
+                continue
+            stddev = outputs[name].stddev[known, column] if name in outputs else np.full(known.sum(), np.nan)
+            figures[name][angle] = {
+                "samples": int(known.sum()),
+                "rms": float(np.sqrt(np.mean(error[known] ** 2))),
+                "coverage": float((np.abs(error[known]) <= common.NORMAL * stddev).mean()),
+                "stddev": float(np.median(stddev)),
+            }
     return figures
 
 
@@ -459,6 +504,7 @@ def main() -> int:
     jobs = [(each, laws[each.subject], correlations[each.subject], methods) for each in clips]
     rows = common.mapped(measure, jobs, args.jobs)
     table = {name: {angle: _summary(rows, subjects, name, angle) for angle in ANGLES} for name in (RAW, *methods)}
+    partial = {name: {angle: _partial(rows, subjects, name, angle) for angle in PARTIAL} for name in (RAW, *methods)}
     trunks = {
         name: [median(row[name]["trunk"] for row in rows if row["subject"] == each) for each in subjects]
         for name in methods
@@ -469,8 +515,15 @@ def main() -> int:
         / sum(row[name]["shoulder"]["square"] for row in rows)
         for name in table
     }
-    figures = {"clips": rows, "table": table, "correlations": correlations, "trunks": trunks, "shoulders": shoulders}
-    common.report(args, figures, lambda: show(table, len(clips), len(files), correlations, trunks, shoulders))
+    figures = {
+        "clips": rows,
+        "table": table,
+        "partial": partial,
+        "correlations": correlations,
+        "trunks": trunks,
+        "shoulders": shoulders,
+    }
+    common.report(args, figures, lambda: show(table, partial, len(clips), len(files), correlations, trunks, shoulders))
     return common.verdicts(args, _bars(table))
 
 
@@ -497,6 +550,21 @@ def _summary(rows: list[dict[str, Any]], subjects: list[str], name: str, angle: 
     }
 
 
+def _partial(rows: list[dict[str, Any]], subjects: list[str], name: str, angle: str) -> dict[str, Any]:
+    """Medians over subjects of the medians over the clips that have the angle, and the mean coverage of subjects."""
+    own = [[row[name][angle] for row in rows if row["subject"] == each and angle in row[name]] for each in subjects]
+    own = [clips for clips in own if clips]
+    covered = [
+        np.average([each["coverage"] for each in clips], weights=[each["samples"] for each in clips]) for clips in own
+    ]
+    return {
+        "subjects": len(own),
+        "clips": sum(map(len, own)),
+        **{key: median(median(each[key] for each in clips) for clips in own) for key in ("rms", "stddev")},
+        "coverage": float(np.mean(covered)) if name != RAW else float("nan"),
+    }
+
+
 def _bars(table: dict[str, dict[str, dict[str, Any]]]) -> dict[str, bool]:
     low, high = COVERAGE
     bars = {}
@@ -511,13 +579,14 @@ def _bars(table: dict[str, dict[str, dict[str, Any]]]) -> dict[str, bool]:
 
 def show(
     table: dict[str, dict[str, dict[str, Any]]],
+    partial: dict[str, dict[str, dict[str, Any]]],
     used: int,
     of: int,
     correlations: dict[str, float],
     trunks: dict[str, list[float]],
     shoulders: dict[str, float],
 ) -> None:
-    """Print the table, errors by subject, the trunk flexions, and the shares of the shoulder's motion."""
+    """Print the tables, errors by subject, the trunk flexions, and the shares of the shoulder's motion."""
     print(f"{used} of {of} clips, {len(correlations)} subjects; degrees")
     print("correlation of a bone's joints without each: " + " ".join(f"{each:.3f}" for each in correlations.values()))
     columns = (
@@ -533,6 +602,13 @@ def show(
             f"{name:<34}"
             + "   ".join(" ".join(f"{each:5.1f}" for each in angles[angle]["subjects"]) for angle in ANGLES)
         )
+    for angle in PARTIAL:
+        there = partial[RAW][angle]
+        head = f"{angle}: {there['clips']} clips, {there['subjects']} people"
+        print(f"{head:<34}{'RMS':>5} {'stddev':>6} {'coverage':>8}")
+        for name, angles in partial.items():
+            own = angles[angle]
+            print(f"{name:<34}{own['rms']:>5.1f} {own['stddev']:>6.1f} {own['coverage']:>8.3f}")
     for name, bent in trunks.items():
         print(f"{f'trunk_flexion, {name}':<34}" + " ".join(f"{each:5.1f}" for each in bent))
     for name, slope in shoulders.items():
