@@ -155,7 +155,10 @@ def in_order(sections: Mapping[str, dict[str, object]]) -> list[tuple[str, dict[
 
 
 def with_file(options: Options, file: Path | None) -> Options:
-    """The options, with values of a parameters file for those at their defaults; ParameterError for an invalid file."""
+    """The options, with values of a parameters file for those at their defaults; ParameterError for an invalid file.
+
+    Where neither chooses a filter, it is that of the system of all sensors.
+    """
     found = dict(options)
     for pattern, values in in_order(read_file(file) if file is not None else {}):
         for option in OPTIONS.values():
@@ -170,7 +173,18 @@ def with_file(options: Options, file: Path | None) -> Options:
                 pattern
             ):
                 found[option.name] = value
+    if not found["filter"]:
+        found["filter"] = _filter_for(found)
     return found
+
+
+def _filter_for(options: Options) -> str:
+    """The default filter of the system that computes all sensors of a graph; empty if several do, or none."""
+    sensors = options["sensors"]
+    assert isinstance(sensors, tuple)
+    filters = {sensor: system.filter for system in SYSTEMS for sensor in system.computes(options)}
+    found = {filters.get(sensor, "") for sensor in sensors}
+    return found.pop() if len(found) == 1 else ""
 
 
 def played(options: Options, topics: Collection[str]) -> tuple[str, ...]:

@@ -222,6 +222,29 @@ def test_robot_and_viewers_subscribe_to_every_sensor() -> None:
             assert found[topic] == plain[topic] + listeners
 
 
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({}, ""),
+        ({"camera": ("camera1",)}, "ekf"),
+        ({"camera": ("camera1", "camera2"), "imus": ("forearm_left",)}, "ekf"),
+        ({"camera": ("camera1",), "sensors": ("kinect1",)}, ""),
+        ({"camera": ("camera1",), "depth": ("kinect1",)}, ""),
+        ({"camera": ("camera1",), "filter": "lkf_zero_velocity"}, "lkf_zero_velocity"),
+    ],
+)
+def test_cameras_alone_are_filtered_by_the_filter_that_knows_angles_by_their_deviations(
+    given: dict[str, Any], expected: str
+) -> None:
+    assert systems.with_file(options_of(**given), None)["filter"] == expected
+
+
+def test_a_parameters_file_chooses_the_filter_of_cameras(tmp_path: Path) -> None:
+    file = tmp_path / "parameters.yaml"
+    file.write_text("skeleton_filter: {ros__parameters: {filter: lkf_constant_velocity}}")
+    assert systems.with_file(options_of(camera=("camera1",)), file)["filter"] == "lkf_constant_velocity"
+
+
 def test_convention_follows_the_robot() -> None:
     file = ROOT / "config" / "robots" / "iiwa7.yaml"
     assert convention_of(file, "") == convention_of(file, "auto") == "isb"

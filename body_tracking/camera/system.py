@@ -139,6 +139,7 @@ SYSTEM = System(
     played=_played,
     finds=lambda topics: _finds(topics) or _finds_compressed(topics),
     computes=lambda options: (*_cameras(options), *_rig(options)),
+    filter="ekf",  # a camera states its errors, of which a linear filter knows no arm to 30 degrees (docs/accuracy.md)
     options=(
         Option(
             "camera",

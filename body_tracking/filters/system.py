@@ -69,7 +69,8 @@ SYSTEM = System(
         Option(
             "filter",
             "",
-            "the filter; overrides the parameters file",
+            "the filter (default: lkf_constant_velocity, or ekf where all sensors are colour cameras); overrides the "
+            "parameters file",
             choices=_filters,
             parameter=("skeleton_filter", "filter"),
             offline=True,

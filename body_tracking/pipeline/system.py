@@ -212,6 +212,7 @@ class System:
             no sensor publishes.
         computes: returns the sensors whose skeletons its own nodes publish; they are added to those of the option
             ``sensors``, and replace its default.
+        filter: the default filter of a graph all of whose sensors it computes; empty for that of other graphs.
         options, topics, services, commands, layers, views: that it adds.
         prepare: ``module:function`` that runs every compiled loop of the system once; empty where it has none.
     """
@@ -224,6 +225,7 @@ class System:
     played: Callable[[Options, Collection[str]], tuple[str, ...]] = lambda options, topics: ()
     finds: Callable[[Mapping[str, str]], Mapping[str, Value]] = lambda topics: {}
     computes: Callable[[Options], tuple[str, ...]] = lambda options: ()
+    filter: str = ""
     options: tuple[Option, ...] = ()
     topics: tuple[TopicSpec, ...] = ()
     services: tuple[Service, ...] = ()

@@ -374,7 +374,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     add_options(
         command,
         *_OFFLINE_OPTIONS,
-        filter=f"default: {DEFAULT_FILTER}",
+        filter=f"default: {DEFAULT_FILTER}, or ekf where all sensors are colour cameras",
         convention="convention of the joint angles (default: that of the filter)",
         sensors="the sensors, the reference first; none: no skeletons, markers or depth alone (default: all in the "
         "bag)",
