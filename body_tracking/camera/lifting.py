@@ -91,7 +91,7 @@ _SHOULDERS = (Joint.SHOULDER_LEFT, Joint.SHOULDER_RIGHT)
 _HIPS = (Joint.HIP_LEFT, Joint.HIP_RIGHT)
 _ARMS: BoolArray = np.array([joint.name.startswith(("ELBOW", "WRIST", "HAND")) for joint in _MADE_OF])
 """Joints that stay unknown where one camera guesses their depth. Such a guess errs by 0.23 m (elbow) to 0.39 m (hand),
-and alike for seconds, so that filters would believe it against a camera that sees the arm; guessed legs err by 0.17 m."""
+and alike for seconds, so that filters would believe it against a camera that sees the arm; legs err by 0.17 m."""
 _PAIRS = tuple(np.array([list(_MADE_OF).index(each) for each in pair]) for pair in (_SHOULDERS, _HIPS))
 _TORSO: IntArray = np.array(
     [Landmark.SHOULDER_LEFT, Landmark.SHOULDER_RIGHT, Landmark.HIP_RIGHT, Landmark.HIP_LEFT], dtype=np.intp

@@ -19,7 +19,7 @@ from body_tracking.evaluation.estimated_segments import EstimatedSegments, read_
 from body_tracking.evaluation.hand_eye import MAX_GAP
 from body_tracking.evaluation.marker_reference import MarkerReference, has_targets, read_marker_reference
 from body_tracking.evaluation.mutual_comparison import USABLE, compare_estimates
-from body_tracking.evaluation.reading import EvaluationError
+from body_tracking.evaluation.reading import EvaluationError, check_same_recording
 from body_tracking.evaluation.reference_comparison import evaluate_by_markers
 from body_tracking.evaluation.reference_error import Judged
 from body_tracking.evaluation.report import Column, Report, Table
@@ -99,14 +99,20 @@ def report_of(sides: Mapping[str, Side]) -> Report:
 
     Args:
         sides: two or more, by name.
+
+    Raises:
+        EvaluationError: no two of them can be compared.
     """
     pairs: dict[tuple[str, str], Pair] = {}
     facts: list[tuple[str, str]] = []
     for one, other in combinations(sides, 2):
         try:
+            check_same_recording(sides[one].source, sides[other].source)
             pairs[one, other] = pairs[other, one] = compare_pair(sides[one], sides[other])
         except EvaluationError as error:
             facts.append(("note", f"{one} and {other} are not compared: {error}"))
+    if not pairs:
+        raise EvaluationError("; ".join(text for _, text in facts))
     names = tuple(sides)
     seconds = max(_seconds(side) for side in sides.values())
     about = _PAIRS + (_TARGETS if any(isinstance(side, MarkerReference) for side in sides.values()) else "")

@@ -19,7 +19,14 @@ from body_tracking.evaluation.marker_reference import (
 )
 from body_tracking.evaluation.mutual_comparison import compare_estimates
 from body_tracking.evaluation.pictures import pictures, reference_pictures
-from body_tracking.evaluation.reading import EvaluationError, Recorded, read_estimate, read_markers, read_truth
+from body_tracking.evaluation.reading import (
+    EvaluationError,
+    Recorded,
+    check_same_recording,
+    read_estimate,
+    read_markers,
+    read_truth,
+)
 from body_tracking.evaluation.reference_comparison import ReferenceEvaluation, evaluate_by_markers
 from body_tracking.evaluation.report import make_folder, report_of, write
 from body_tracking.pipeline import graph
@@ -153,6 +160,8 @@ def run(args: argparse.Namespace) -> int:
         report = reference_report.report_of(judged)
         draw: Callable[[], list[tuple[str, str]]] = partial(reference_pictures, judged.curves)
     elif _by_estimate(args):
+        if not args.own_clock:
+            check_same_recording(args.estimate, args.truth)
         mutual = compare_estimates(read_segments(args.estimate, args.topic, args.body), read_segments(args.truth))
         report, draw = reference_report.mutual_report_of(mutual), list
     else:
@@ -177,6 +186,8 @@ def _compare(args: argparse.Namespace) -> Evaluation:
     try:
         estimate = read_estimate(args.estimate, args.topic, args.body)
         truth, own_clock = truth_from(args)
+        if args.truth is not None and not own_clock:
+            check_same_recording(args.estimate, args.truth)
         return evaluate(estimate, truth, own_clock, lambda share: progress.at(int(1000 * share)))
     finally:
         progress.end()

@@ -167,11 +167,9 @@ def read(path: Path, body: str | None = None, truth: Path | None = None) -> Trac
             raise EvaluationError(f"{path}: holds no joint angles ({_PREFIX}<id>{_SUFFIX}); make some with replay")
         body, angles = read_angles(bag, body)
         skeletons = read_skeletons(bag, graph.FILTERED)
-        sensors = {} if truth is None else _sensor_stamps(bag, bag.topics)
+    if truth is not None:
+        check_same_recording(path, truth)
     with RigReader(truth or path) as bag:
-        for topic, stamps in _sensor_stamps(bag, sensors).items():
-            if stamps.isdisjoint(sensors[topic]):
-                raise EvaluationError(f"{truth}: is another recording than {path}: no frame of {topic} is in both")
         topic = graph.true_angles_topic(body)
         own = read_joint_states(bag, topic if topic in bag.topics else graph.TRUE_ANGLES, body)
         coordinates = read_joint_states(bag, graph.TRUE_MODEL_STATE, "")
@@ -185,6 +183,16 @@ def read(path: Path, body: str | None = None, truth: Path | None = None) -> Trac
             true_angles=true_angles(angles.names, own, coordinates),
             true_skeletons=read_skeletons(bag, graph.TRUE_SKELETON),
         )
+
+
+def check_same_recording(path: Path, other: Path) -> None:
+    """EvaluationError if a sensor published skeletons in both bags, and no frame of it is in both."""
+    with RigReader(path) as bag:
+        sensors = _sensor_stamps(bag, bag.topics)
+    with RigReader(other) as bag:
+        for topic, stamps in _sensor_stamps(bag, sensors).items():
+            if stamps.isdisjoint(sensors[topic]):
+                raise EvaluationError(f"{other}: is another recording than {path}: no frame of {topic} is in both")
 
 
 def _sensor_stamps(bag: BagReader, topics: Collection[str]) -> dict[str, set[int]]:

@@ -13,6 +13,7 @@ from known_errors import NOISY, START_NS, Scene, correlated_noise, scene
 from body_tracking.cli import main
 from body_tracking.core.message_types import JOINT_STATE
 from body_tracking.core.skeleton import NANOSECONDS
+from body_tracking.evaluation.compare import report_of
 from body_tracking.evaluation.estimated_segments import EstimatedSegments, read_true_segments
 from body_tracking.evaluation.mutual_comparison import compare_estimates
 from body_tracking.evaluation.reading import EvaluationError
@@ -111,6 +112,13 @@ def test_every_system_is_compared_with_every_other_and_the_truth(
     }
     true = read_true_segments(folder / "true")
     assert true is not None and not true.angles.stddev.any()
+
+
+def test_systems_of_two_recordings_are_not_compared(one: Scene) -> None:
+    bags = Path(__file__).parents[2] / "bags"
+    sides = {name: replace(one.estimate(), source=bags / name) for name in ("tpose_wave", "tpose_slow_down")}
+    with pytest.raises(EvaluationError, match=r"tpose_slow_down: is another recording than .*tpose_wave"):
+        report_of(sides)
 
 
 def test_another_estimate_is_a_reference_that_errs_itself(

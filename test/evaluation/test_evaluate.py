@@ -135,6 +135,10 @@ def test_fused_skeletons_are_judged_where_asked_or_where_there_are_no_others(
             ["{two}", "--truth", "{twist}"],
             r"do not overlap in time: .*two from 1\.000 to 1\.000 s, .*from 17500000",
         ),
+        (
+            ["{wave}", "--truth", "{twist}"],
+            r"twist: is another recording than .*: no frame of /kinect1/skeleton is in both",
+        ),
         (["{twist}"], r"no topic /filtered/skeleton \(skeletons there: /ground_truth/skeleton, /kinect1"),
         (["{angles}"], r"angles: joint angles without skeletons, .*`body_tracking show \S*angles` compares them"),
         (["{wave}", "--topic", "/calibration"], r"/calibration holds geometry_msgs/msg/TransformStamped, expected"),
