@@ -86,6 +86,16 @@ def test_lost_messages_are_counted_by_sequence_numbers() -> None:
     assert sequences.lost == {"one": 3}
 
 
+def test_messages_between_two_subscriptions_are_not_lost() -> None:
+    sequences = Sequences()
+    for number in (5, 6):
+        sequences.note("one", number)
+    sequences.forget("one")
+    for number in (200, 201):
+        sequences.note("one", number)
+    assert not +sequences.lost and not sequences.switched["one"]
+
+
 def test_alternating_publishers_are_counted_and_a_restart_once() -> None:
     sequences = Sequences()
     for number in (5, 6, 9, 10, 1, 2, 3):

@@ -164,6 +164,7 @@ class ViewerNode(GraphNode):
             systems.LAYERS,
             self.views,
             given["start_page"],
+            bool(self.get_parameter("use_sim_time").value),
         )
         print(f"open {page.address} in a browser", flush=True)
         self.get_logger().info(f"the page is at {page.address}")
@@ -351,7 +352,7 @@ class ViewerNode(GraphNode):
                 self.angles.popleft()
                 if stamp_ns in stddevs and stddevs[stamp_ns][0] == names:
                     own = [name.removesuffix(f"_{self.body}") for name in names]
-                    self.history.add(stamp_ns, own, values, stddevs[stamp_ns][1])
+                    self.history.add(stamp_ns, own, values, stddevs[stamp_ns][1], time.monotonic_ns())
         except MessageError as error:
             self.angles.clear()
             self.malformed(graph.joint_states_topic(self.body), str(error))

@@ -135,6 +135,11 @@ class Sequences:
         if number > before + 1:
             self.lost[topic] += number - before - 1
 
+    def forget(self, topic: str) -> None:
+        """Count nothing that is published from now until the next message."""
+        self._latest.pop(topic, None)
+        self._last.pop(topic, None)
+
 
 _UNKNOWN = 2**64 - 1
 """The number of a middleware without sequence numbers."""

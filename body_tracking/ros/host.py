@@ -77,7 +77,7 @@ class StageNode(GraphNode):
             self.outputs[topic] = port, publisher
         taken = {port.topic: port for port in self.stage.inputs}
         for topic in self.inputs.keys() - taken.keys():
-            self.destroy_subscription(self.inputs.pop(topic)[1])
+            self.unsubscribe_port(*self.inputs.pop(topic))
         for topic, port in taken.items():
             self.inputs[topic] = port, self.inputs[topic][1] if topic in self.inputs else self._subscription(port)
 
@@ -100,8 +100,7 @@ class StageNode(GraphNode):
         """Subscribe again where the publishers of another package offer another quality of service than before."""
         for topic, (port, subscription) in tuple(self.inputs.items()):
             if port.foreign and self._request(port) != self._requested[topic]:
-                self._droppable.pop(subscription, None)
-                self.destroy_subscription(subscription)
+                self.unsubscribe_port(port, subscription)
                 self.inputs[topic] = port, self._subscription(port)
 
     def _subscription(self, port: Port) -> Subscription:

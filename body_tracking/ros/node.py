@@ -418,6 +418,13 @@ class GraphNode(BatchNode):
             self._droppable[subscription] = self.full_name(port.topic)
         return subscription
 
+    def unsubscribe_port(self, port: Port, subscription: Subscription) -> None:
+        """End a subscription of :meth:`subscribe_port`; what is published until the next one is not lost."""
+        self._droppable.pop(subscription, None)
+        name = self.resolve_topic_name(port.topic) if port.absolute else self.full_name(port.topic)
+        self.sequences.forget(name)
+        self.destroy_subscription(subscription)
+
     def is_stale(self, topic: str, sent_ns: int) -> bool:
         """Whether a frame was sent before a standstill of this process and is too old; never with ``reliable``."""
         return not self.values["reliable"] and self.standstill.is_stale(topic, sent_ns, time.time_ns())

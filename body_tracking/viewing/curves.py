@@ -18,6 +18,8 @@ BAND: Final = 1.959963984540054
 """Half width of the 95 % band of a normal distribution, in standard deviations."""
 WIDEST: Final = 60.0
 """Limit of a band's half width, degrees, also for infinite standard deviations."""
+_GAP_NS: Final = NANOSECONDS
+"""Greatest time between two messages over which a curve is drawn as if measured."""
 _HALF_TURN: Final = 180.0
 _DECIMALS: Final = 3
 """Most decimals of an angle in degrees."""
@@ -78,6 +80,7 @@ class AngleHistory:
         self.window = window
         self.names: tuple[str, ...] = ()
         self._rows: deque[tuple[int, FloatArray]] = deque(maxlen=capacity)
+        self._received_ns = 0
 
     def clear(self) -> None:
         self._rows.clear()
@@ -85,21 +88,34 @@ class AngleHistory:
     def __len__(self) -> int:
         return len(self._rows)
 
-    def add(self, stamp_ns: int, names: Sequence[str], positions: FloatArray, stddevs: FloatArray) -> None:
-        """Add a message; messages out of order are ignored, and other names or a jump back in time clear the history.
+    def add(
+        self, stamp_ns: int, names: Sequence[str], positions: FloatArray, stddevs: FloatArray, steady_ns: int = 0
+    ) -> None:
+        """Add a message; messages out of order are ignored.
+
+        Other names, a jump back in time, or one forward over a time that has not passed, as of a bag that is continued
+        at another place, clear the history. Over a gap that has passed, the angles are unknown.
 
         Args:
             stamp_ns: capture time.
             names: of n angles.
             positions: (n,) radians.
             stddevs: (n,) radians, infinity where not known.
+            steady_ns: time of receipt by a steady clock.
         """
         last = self._rows[-1][0] if self._rows else None
-        if tuple(names) != self.names or jumped_back(stamp_ns, last):
+        gap = 0 if last is None else stamp_ns - last
+        skipped = gap > _GAP_NS and steady_ns - self._received_ns < gap // 2
+        self._received_ns = steady_ns
+        if tuple(names) != self.names or jumped_back(stamp_ns, last) or skipped:
             self.names = tuple(names)
             self.clear()
         elif last is not None and stamp_ns <= last:
             return
+        elif last is not None and gap > _GAP_NS:
+            unknown = np.full((2, len(self.names)), np.inf)
+            unknown[0] = np.nan
+            self._rows += [(last + 1, unknown), (stamp_ns - 1, unknown)]
         self._rows.append((stamp_ns, np.degrees([positions, stddevs])))
         while self._rows[0][0] < stamp_ns - round(self.window * NANOSECONDS):
             self._rows.popleft()

@@ -80,6 +80,7 @@ class Page:
         layers: further layers of the scene, of other systems.
         views: of other systems, from several topics.
         start_page: whether the start page returns at this address when the graph ends.
+        plays: whether a bag takes the place of the sensors.
 
     Attributes:
         visible: which layers are switched on, by name.
@@ -100,9 +101,11 @@ class Page:
         layers: Sequence[Layer] = (),
         views: Sequence[SystemView] = (),
         start_page: bool = False,
+        plays: bool = False,
     ) -> None:
         self._server = serve(host, port)
         self._controls = controls
+        self._plays = plays
         self._choices = {**LAYERS, **{each.name: (each.text, each.shown) for each in layers}}
         for view in views:
             self._choices |= view.layers
@@ -264,7 +267,7 @@ class Page:
         gui.main_panel.dock_right()
         gui.main_panel.set_width(WIDTH)
         sensors = tuple(self._colours)
-        self._panel = ControlPanel(self._server, self._controls, filters, conventions, sensors, start_page)
+        self._panel = ControlPanel(self._server, self._controls, filters, conventions, sensors, start_page, self._plays)
         self._legend = gui.add_html(self._legend_text())
         with gui.add_folder("Show", expand_by_default=False):
             boxes = {name: self._checkbox(name, label, shown) for name, (label, shown) in self._choices.items()}

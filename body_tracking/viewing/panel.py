@@ -39,6 +39,7 @@ class ControlPanel:
         conventions: options.
         sensors: names of the sensors of skeletons.
         start_page: whether the start page returns at this address when the graph ends.
+        plays: whether a bag takes the place of the sensors.
     """
 
     def __init__(
@@ -49,9 +50,10 @@ class ControlPanel:
         conventions: Sequence[str],
         sensors: Sequence[str] = (),
         start_page: bool = False,
+        plays: bool = False,
     ) -> None:
         self._server, self._controls, self._sensors = server, controls, tuple(sensors)
-        self._start_page = start_page
+        self._start_page, self._plays = start_page, plays
         gui = server.gui
         self._state = gui.add_html(state_html({}, 0.0))
         self._groups: dict[str, list[Any]] = {}
@@ -75,7 +77,7 @@ class ControlPanel:
 
     def draw(self, statuses: Mapping[str, NodeStatus], now: float, ended: bool) -> None:
         """Show the state of the graph, the controls of its nodes and the current choices."""
-        self._state.content = state_html(statuses, now, ended, self._sensors, self._start_page)
+        self._state.content = state_html(statuses, now, ended, self._sensors, self._start_page, self._plays)
         show(self._end, not ended and self._controls.offers(END))
         there = {} if ended else fresh(statuses, now)
         for node, controls in self._groups.items():

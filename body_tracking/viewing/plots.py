@@ -107,12 +107,13 @@ class _Plot:
             height=HEIGHT,
             padding=(4, 8, 0, 0),
         )
+        self._choice.visible = self._plot.visible = False  # until there is an angle
 
     def offer(self, names: tuple[str, ...], chosen: str) -> None:
         """Offer these angles, and show the chosen one; hide the plot without a chosen one."""
         self._names = {label_of(name): name for name in names} or {NONE: ""}
         self._choice.options = tuple(self._names)
-        self._choice.visible = self._plot.visible = bool(chosen) or not names
+        self._choice.visible = self._plot.visible = bool(chosen)
         if chosen:
             self._choice.value = label_of(chosen)
 

@@ -21,8 +21,10 @@ _RETURNS: Final = (
     "<code>body_tracking view</code> has ended too: start it again."
 )
 
+_STARTED_S: Final = 3.0
+"""Seconds of a bag after which each of its sensors has been heard and reported."""
 _NOTHING: Final = (
-    "look at its cable and its program, and whether it publishes in this ROS domain (<code>body_tracking doctor</code>)"
+    "look at cable and program, and whether it publishes in this ROS domain (<code>body_tracking doctor</code>)"
 )
 
 
@@ -37,6 +39,7 @@ def state_html(
     ended: bool = False,
     sensors: Sequence[str] = (),
     start_page: bool = False,
+    plays: bool = False,
 ) -> str:
     """The state as HTML.
 
@@ -46,12 +49,15 @@ def state_html(
         ended: the graph has ended.
         sensors: names of the sensors of skeletons.
         start_page: whether the start page returns at this address when the graph ends.
+        plays: whether a bag takes the place of the sensors.
     """
     there = {} if ended else fresh(statuses, now)
     if ended or (statuses and not there):
         return block([line(GREY, "ended", _RETURNS) if start_page else line(RED, "ended", _ENDED)])
     if not there:
         return block([line(ORANGE, "waiting", "no node has reported yet")])
+    if plays and PLAYER not in there:
+        return block([line(GREY, "waiting", "the recording starts once all nodes have started")])
     lines = [*_input(there, sensors), _calibration(there), _recording(there)]
     return block([each for each in lines if each])
 
@@ -76,11 +82,14 @@ def _input(there: Mapping[str, NodeStatus], sensors: Sequence[str]) -> list[str]
                     rates[sensor] = max(rate, rates.get(sensor, 0.0))
     if rates and player is not None and player.text != "playing":
         lines.append(line(GREY, "sensors", f"{', '.join(map(html.escape, sorted(rates)))}: {html.escape(player.text)}"))
+    elif rates and player is not None and not any(rates.values()) and position < _STARTED_S:
+        lines.append(line(GREY, "sensors", f"{', '.join(map(html.escape, sorted(rates)))}: the recording starts"))
     elif rates:
         words = ", ".join(f"{html.escape(sensor)} {rate:.0f} Hz" for sensor, rate in sorted(rates.items()))
         silent = [html.escape(sensor) for sensor, rate in sorted(rates.items()) if not rate]
         if silent:
-            words += f". <b>Nothing comes from {' and '.join(silent)}</b>: {_NOTHING}"
+            words += f". <b>Nothing comes from {' and '.join(silent)}</b>"
+            words += ": the recording has nothing of it at this time" if player is not None else f": {_NOTHING}"
         lines.append(line(ORANGE if silent else GREEN, "sensors", words))
     return lines
 

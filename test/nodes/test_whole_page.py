@@ -199,7 +199,7 @@ def test_live_sensors_one_of_which_is_lost(start_page: Browser) -> None:
     browser.answer("messages in")
 
     assert stop(running.processes.pop("kinect2_skeleton")) == 0
-    browser.reads(r"Nothing comes from kinect2: look at its cable")
+    browser.reads(r"Nothing comes from kinect2: look at cable")
     browser.save("viewer_lost.png", 170)
     assert stop(running.processes.pop("kinect1_skeleton")) == 0
     browser.reads(r"Nothing comes from kinect1 and kinect2")

@@ -24,6 +24,21 @@ def filled(count: int, window: float = 1000.0, stddev: float = 0.01) -> AngleHis
     return history
 
 
+def test_a_bag_that_is_continued_at_another_place_begins_new_curves() -> None:
+    history = filled(10)
+    history.add(500 * STEP_NS, NAMES, np.zeros(2), np.full(2, 0.01), STEP_NS)
+    assert len(history) == 1
+
+
+def test_over_a_gap_the_angles_are_unknown() -> None:
+    history = filled(10)
+    history.add(500 * STEP_NS, NAMES, np.zeros(2), np.full(2, 0.01), 490 * STEP_NS)
+    curve = history.curve(NAMES[0], 200)
+    assert curve is not None and len(curve.times) == 13
+    np.testing.assert_allclose(curve.high[10:12] - curve.values[10:12], WIDEST)
+    assert curve.values[11] == curve.values[9]
+
+
 # --- decimation
 
 

@@ -49,6 +49,19 @@ def test_a_sensor_that_sends_nothing_is_named() -> None:
     assert "Nothing comes" not in state_html(paused, 0.0, sensors=("a", "b", "c"))
 
 
+def test_a_recording_that_has_not_begun_is_no_fault() -> None:
+    rates = {"rate in /a/skeleton": "0.0", "rate in /b/skeleton": "0.0"}
+    fusion = {"fusion": NodeStatus("fusion: stream", 0, "OK", rates)}
+    text = state_html(fusion, 0.0, sensors=("a", "b"), plays=True)
+    assert "the recording starts once all nodes have started" in text and "Nothing comes" not in text
+    begun, later = (
+        NodeStatus("bag_player: stream", 0, "playing", {**PLAYER, "position s": at}) for at in ("0.4", "5.0")
+    )
+    assert "a, b: the recording starts" in state_html({**fusion, "bag_player": begun}, 0.0, plays=True)
+    text = state_html({**fusion, "bag_player": later}, 0.0, plays=True)
+    assert "Nothing comes from a and b" in text and "cable" not in text
+
+
 def test_a_paused_bag_is_no_fault() -> None:
     rates = {"rate in /a/skeleton": "0.0", "rate in /b/skeleton": "0.0"}
     there = {
