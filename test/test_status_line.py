@@ -79,3 +79,17 @@ def test_the_recorder_rightly_waits_for_a_bag_that_has_not_begun() -> None:
     assert "bag_recorder: disk full" in line(with_bag, 2, "disk full")
     monitor.clock_ns = 1
     assert "bag_recorder: 2 topics" in line(with_bag, 1, "2 topics are not recorded")
+    # nodes report once a second: the clock runs, of which the recorder's report knows nothing yet
+    monitor._statuses["bag_player"] = NodeStatus("", 0, "playing", {"position s": "0.4"}, received=time.monotonic())
+    monitor._statuses["bag_recorder"] = NodeStatus("", 1, waiting, received=time.monotonic())
+    assert "bag_recorder" not in monitor.line(with_bag, 1.0, {})
+
+
+def test_a_recording_that_the_page_began_is_named_at_the_end() -> None:
+    monitor = object.__new__(GraphMonitor)  # without a node
+    monitor.angles = 7
+    monitor._statuses = {"bag_recorder": NodeStatus("", 0, "stopped", {"messages": "120", "bag": "session_2"})}
+    options = {"bag": "", "record": None}
+    assert monitor.summary(options, 3.0, {}) == "ran for 3.0 s: 7 frames of joint angles, recorded in session_2"
+    monitor._statuses = {"bag_recorder": NodeStatus("", 0, "stopped", {"messages": "0", "bag": "None"})}
+    assert monitor.summary(options, 3.0, {}) == "ran for 3.0 s: 7 frames of joint angles"

@@ -39,6 +39,8 @@ _SHOWING = ("viewer", "body_markers")
 """Nodes that show the latest messages, and leave out others on purpose."""
 _NOTABLE_LOSS = 0.01
 """Share of a node's received messages."""
+_REPORTED_S = 1.5
+"""Seconds of a bag after which each node has reported what it gets of it."""
 _FRESH = 3.0
 """Seconds for which a node's diagnostics are valid."""
 
@@ -55,7 +57,7 @@ def problem_parts(statuses: Mapping[str, NodeStatus], *, bag_starts: bool = Fals
 
     Args:
         statuses: by node.
-        bag_starts: a bag is to be played and has not begun: the recorder rightly waits for its clock.
+        bag_starts: a bag is to be played and has hardly begun: the recorder rightly waits for its clock.
     """
     bad = {name: each.text for name, each in statuses.items() if each.level and each.text and name not in _OWN_PART}
     if bag_starts and "bag_recorder" in bad and statuses["bag_recorder"].level == 1:
@@ -177,17 +179,20 @@ class GraphMonitor:
         fresh = {name: status for name, status in self._statuses.items() if now - status.received < _FRESH}
         parts = [f"{elapsed:6.1f} s"]
         player = fresh.get("bag_player")
-        if player is not None:
-            parts[0] += f" (bag {float(player.values['position s']):.1f}/{float(player.values['duration s']):.1f} s)"
-        elif options["bag"] and not self.clock_ns:
+        position = 0.0 if player is None else player.number("position s") or 0.0
+        # nodes report once a second: until then they know nothing of a bag that plays already
+        starts = bool(options["bag"]) and (not self.clock_ns or (player is not None and position < _REPORTED_S))
+        if starts and not position and not self.angles:
             parts[0] += " (the bag plays once all nodes have started)"
+        elif player is not None:
+            parts[0] += f" (bag {position:.1f}/{player.number('duration s') or 0.0:.1f} s)"
         parts.append(self._rates(options, fresh))
         delay = self._delay(options, fresh)
         if delay:
             parts.append(delay)
         parts += calibration_part(fresh.get("calibration"), sensors_of(options))
         if not self.angles:
-            parts += problem_parts(fresh, bag_starts=bool(options["bag"]) and not self.clock_ns)
+            parts += problem_parts(fresh, bag_starts=starts)
         malformed = sum(int(status.values.get("malformed", 0)) for status in fresh.values())
         if malformed:
             parts.append(f"malformed {malformed}")
@@ -245,6 +250,8 @@ class GraphMonitor:
         if options["record"]:
             made = Path(str(options["record"])).exists()
             text += f", recorded in {options['record']}" if made else ", nothing was recorded"
+        elif (recorder := self._statuses.get("bag_recorder")) is not None and recorder.number("messages"):
+            text += f", recorded in {recorder.values.get('bag', '')}"  # by the page or the service
         text += "".join(f"; {part}" for part in losses_part(self._statuses))
         if restarts:
             text += "; restarts: " + ", ".join(f"{name} {count}" for name, count in restarts.items())
