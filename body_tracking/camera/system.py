@@ -195,7 +195,7 @@ SYSTEM = System(
             graph.SKELETON,
             "camera_skeleton",
             "the joints of people in `<camera>_optical_frame`, those of the colour camera, with covariance as "
-            "`/fused/skeleton`; joints that are hidden are inferred, those outside the image not tracked",
+            "`/fused/skeleton`; hidden joints are inferred, those of arms and those outside the image not tracked",
         ),
         TopicSpec(
             graph.skeleton_topic(RIG_SENSOR),

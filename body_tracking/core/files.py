@@ -148,7 +148,8 @@ def load_yaml(text: str, loader: Any = SafeLoader, *, aliases: bool = True) -> A
     except yaml.MarkedYAMLError as error:
         if "nesting depth" in str(error):  # libyaml's own limit (1000), reached before it emits the first event
             raise FileLimitError(f"is not read (nested deeper than {MAX_DEPTH})") from error
-        raise FileError(f"is not YAML ({' '.join(str(error).split())})") from error
+        said = " ".join(str(error).split()).replace(' in "<unicode string>",', " in")
+        raise FileError(f"is not YAML ({said})") from error
     except Exception as error:  # constructors of numbers and times raise errors of their own
         raise FileError(f"is not YAML ({' '.join(str(error).split()) or type(error).__name__})") from error
 

@@ -10,7 +10,7 @@ import numpy as np
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.evaluation.metrics import angle_errors, wrapped
 from body_tracking.evaluation.pictures import are_fine, draw
-from body_tracking.evaluation.reading import AngleSeries, read, true_at
+from body_tracking.evaluation.reading import AngleSeries, EvaluationError, read, true_at
 from body_tracking.evaluation.report import Column, Table, make_folder
 
 _ENOUGH = 0.02
@@ -94,6 +94,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
+    if args.output is not None and args.output.suffix.lower() != ".png":
+        raise EvaluationError(f"{args.output}: expected a name that ends in .png")
     table = summarise(args.bag, args.output, args.body, args.truth)
     print(f"{table.text()}\n{table.note}")
     if args.output is not None:

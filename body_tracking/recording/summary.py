@@ -19,6 +19,10 @@ _READ: Final = 1000
 """Number of messages read per person, evenly over the bag; at most twice this number."""
 
 
+_MUCH = 5.0
+"""Difference of two shares, in percent, by which an angle is known much less often than another."""
+
+
 def summary(path: Path) -> Iterator[str]:
     """A line for each sensor with a pose, and for each limb of each person with angles.
 
@@ -65,7 +69,9 @@ def _angles(bag: BagReader, body: str) -> Iterator[str]:
             for name, stddev in zip(names, np.degrees(stddevs), strict=True):
                 found.setdefault(name.removesuffix(f"_{body}"), []).append(float(stddev))
     for limb, names_of_limb in by_limb(found).items():
-        medians, shares, unknown = [], [], []
+        medians: list[float] = []
+        shares: dict[str, float] = {}
+        unknown: list[str] = []
         for name in names_of_limb:
             stddevs = np.array(found[name])
             known = stddevs[stddevs < UNKNOWN]  # not NaN or infinity
@@ -73,10 +79,12 @@ def _angles(bag: BagReader, body: str) -> Iterator[str]:
                 unknown.append(label_of(name))
             else:
                 medians.append(float(np.median(known)))
-                shares.append(100.0 * len(known) / len(stddevs))
+                shares[label_of(name)] = 100.0 * len(known) / len(stddevs)
         text = f"{body}, {limb}: {len(medians)} of {len(names_of_limb)} angles with a standard deviation below "
         text += f"{UNKNOWN:.0f} deg"
         if medians:
             size = " to ".join(dict.fromkeys((f"{min(medians):.1f}", f"{max(medians):.1f}")))
-            text += f", in {np.mean(shares):.0f} % of the frames; median {size} deg"
+            least = min(shares, key=lambda name: shares[name])
+            among = f" ({least} least often)" if max(shares.values()) - shares[least] > _MUCH else ""
+            text += f", each in at least {shares[least]:.0f} % of the frames{among}; median {size} deg"
         yield text + (f"; not {', '.join(unknown)}" if unknown else "")

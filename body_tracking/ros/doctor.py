@@ -183,7 +183,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "publishers and subscribers in the ROS domain, or a recording, and says what to do. Exit code 1 "
         "if there is a problem.",
     )
-    parser.add_argument("--bag", type=Path, metavar="BAG", help="check this recording instead")
+    parser.add_argument("bag", nargs="?", type=Path, metavar="BAG", help="check this recording instead")
+    parser.add_argument("--bag", dest="named", type=Path, metavar="BAG", help=argparse.SUPPRESS)
     parser.add_argument(
         "--sensors", default="", metavar="A,B", help="sensors that must publish; in a namespace: NAMESPACE/A"
     )
@@ -192,6 +193,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """``body_tracking doctor``."""
+    args.bag = args.bag or args.named
     counts = Counter[str]()
     for finding in examine(args):
         counts[finding.level] += 1

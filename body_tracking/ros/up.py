@@ -548,7 +548,9 @@ def _sensors_there(namespace: str) -> Mapping[str, Value]:
     found = look(namespace).sensors
     if not found:
         others = (
-            "on this machine (ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET: on others, too)" if dds.is_local() else "anywhere"
+            "on this machine (set ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET to look on others, too)"
+            if dds.is_local()
+            else "anywhere"
         )
         raise UpError(
             f"no sensor publishes in ROS domain {os.environ.get('ROS_DOMAIN_ID') or '0'} {others}: no skeletons, depth "

@@ -100,6 +100,8 @@ def _graph(args: argparse.Namespace, choice: Any) -> argparse.Namespace:
         chosen |= setup
     if choice.filter != DEFAULT:
         chosen["filter"] = choice.filter
+    if choice.convention != DEFAULT:
+        chosen["convention"] = choice.convention
     return argparse.Namespace(**{**vars(args), **chosen})
 
 
@@ -115,12 +117,16 @@ def _choose(
     except ImportError as error:
         raise UpError(f"the page needs viser ({error}): pip install 'body_tracking[viewer]'") from error
     from body_tracking.filters import FILTERS
+    from body_tracking.kinematics.tracking import ALL_CONVENTIONS
     from body_tracking.ros.discovery import Domain, Watch
     from body_tracking.viewing.state import GREEN, ORANGE, RED
 
     named = (args.params_file is not None and has_sensors(args.params_file)) or names_sensors(options_from(args))
     chosen: queue.Queue[Any] = queue.Queue()
-    with StartPage(host, port, tuple(FILTERS), chosen.put, before) as page, Watch(args.namespace or "/") as watch:
+    with (
+        StartPage(host, port, tuple(FILTERS), tuple(ALL_CONVENTIONS), chosen.put, before) as page,
+        Watch(args.namespace or "/") as watch,
+    ):
         if before is None:
             print(f"open {page.address} in a browser; Ctrl-C ends", flush=True)
         if said:

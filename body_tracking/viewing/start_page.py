@@ -45,11 +45,13 @@ class Choice:
         bag: to play; None for the publishing sensors.
         loop: play it in a loop.
         filter: a name, or :data:`DEFAULT`.
+        convention: of the angles; a name, or :data:`DEFAULT` for the filter's.
     """
 
     bag: Path | None
     loop: bool
     filter: str
+    convention: str = DEFAULT
 
 
 class StartPage:
@@ -59,8 +61,9 @@ class StartPage:
         host: address to listen on.
         port: the first one to try.
         filters: options.
+        conventions: options.
         choose: called with the user's choice, in a thread of the server.
-        before: the user's previous choice, whose loop and filter are offered again.
+        before: the user's previous choice, whose loop, filter and convention are offered again.
 
     Raises:
         PageError: as of :func:`serve`.
@@ -71,11 +74,12 @@ class StartPage:
         host: str,
         port: int,
         filters: Sequence[str],
+        conventions: Sequence[str],
         choose: Callable[[Choice], None],
         before: Choice | None = None,
     ) -> None:
         self._choose = choose
-        looped, chosen = (before.loop, before.filter) if before is not None else (False, DEFAULT)
+        before = before or Choice(None, False, DEFAULT)
         self._server = serve(host, port)
         scene, gui = self._server.scene, self._server.gui
         scene.set_up_direction("+z")
@@ -89,8 +93,14 @@ class StartPage:
             self._sensors = gui.add_html("")
             self._start: Any = gui.add_button("start with these sensors", visible=False)
         with gui.add_folder("How"):
-            self._filter: Any = gui.add_dropdown("filter", (DEFAULT, *filters), initial_value=chosen)
-            self._loop: Any = gui.add_checkbox("loop", looped, hint="play the recording again at its end")
+            self._filter: Any = gui.add_dropdown("filter", (DEFAULT, *filters), initial_value=before.filter)
+            self._convention: Any = gui.add_dropdown(
+                "angles",
+                (DEFAULT, *conventions),
+                initial_value=before.convention,
+                hint="isb suits arms raised sideways",
+            )
+            self._loop: Any = gui.add_checkbox("loop", before.loop, hint="play the recording again at its end")
         with gui.add_folder("Nodes"):
             self._nodes = gui.add_html("")
         self._start.on_click(lambda _: self._choose(self._choice(None)))
@@ -181,7 +191,7 @@ class StartPage:
             part.content = content
 
     def _choice(self, bag: Path | None) -> Choice:
-        return Choice(bag, bool(self._loop.value), str(self._filter.value))
+        return Choice(bag, bool(self._loop.value), str(self._filter.value), str(self._convention.value))
 
     def _on_open(self) -> None:
         if self._path.value.strip():

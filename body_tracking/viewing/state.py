@@ -107,7 +107,7 @@ def _calibration(there: Mapping[str, NodeStatus]) -> str:
             if degrees is not None and millimetres is not None:
                 known.append(f"{html.escape(sensor)} to {degrees:.1f}° and {millimetres:.0f} mm")
     if status.text.startswith("waiting for a still pose"):
-        todo = "stand still for two seconds where all sensors see you, arms to the sides"
+        todo = "hold a T-pose (arms straight, level and sideways) for four seconds where all sensors see you"
     elif status.level:
         todo = "walk about and turn where all sensors see you, until this is green"
     elif known:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,19 +12,19 @@ pytest.importorskip("viser", reason="viser is not installed")
 from body_tracking.viewing.start_page import DEFAULT, Choice, StartPage
 from body_tracking.viewing.state import GREEN, RED
 
-FILTERS = ("lkf_constant_velocity", "ekf")
+FILTERS, CONVENTIONS = ("lkf_constant_velocity", "ekf"), ("model", "isb")
 
 
-@pytest.mark.parametrize("before", [None, Choice(Path("wave"), True, "ekf"), Choice(None, False, DEFAULT)])
-def test_loop_and_filter_are_offered_again(before: Choice | None) -> None:
+@pytest.mark.parametrize("before", [None, Choice(Path("wave"), True, "ekf", "isb"), Choice(None, False, DEFAULT)])
+def test_loop_filter_and_convention_are_offered_again(before: Choice | None) -> None:
     """After a recording has ended, or a graph did not start, the user need not set them anew."""
-    with StartPage("127.0.0.1", 18080, FILTERS, lambda choice: None, before) as page:
+    with StartPage("127.0.0.1", 18080, FILTERS, CONVENTIONS, lambda choice: None, before) as page:
         found = page._choice(None)
-    assert found == Choice(None, before is not None and before.loop, DEFAULT if before is None else before.filter)
+    assert found == (Choice(None, False, DEFAULT) if before is None else replace(before, bag=None))
 
 
 def test_the_page_is_not_ready_while_another_graph_runs() -> None:
-    with StartPage("127.0.0.1", 18080, FILTERS, lambda choice: None) as page:
+    with StartPage("127.0.0.1", 18080, FILTERS, CONVENTIONS, lambda choice: None) as page:
         page.say("wave has ended; choose anew.", GREEN)
         page.draw_domain("", ("/fusion",), True, "none")
         assert "runs already" in page._state.content and ">ready<" not in page._state.content
