@@ -27,6 +27,8 @@ _DASHES = (0.0, (4.0, 3.0))
 _TRUNK = "#3a3a3a"
 """Of the person's bones without a side: dark, since the true person is grey."""
 _COLUMNS, _INSTANTS = 4, 6
+ENOUGH = 0.02
+"""Least share of the frames in which an angle is known to be drawn, and to have statistics."""
 _POINTS = 1500
 """Largest number of points of a curve; the picture has no more columns."""
 _STILL = 30.0
@@ -171,6 +173,7 @@ def _draw_angles(figure: Any, angles: AngleComparison, still: float = _STILL) ->
     times, found, true, stddev = _with_gaps(angles.times[shown], *(each[shown] for each in series))
     band = 1.96 * np.degrees(np.where(np.isfinite(stddev), stddev, np.nan))
     found, true = np.degrees(found), np.degrees(true)
+    found[:, np.isfinite(angles.found).mean(axis=0) < ENOUGH] = np.nan
     for axis, (title, columns) in zip(axes.flat, panels.items(), strict=False):
         for column in columns:
             side, curve = _side(angles.names[column]), _unbroken(found[:, column])
@@ -211,6 +214,7 @@ def _draw_person(figure: Any, tracked: Tracked, start_ns: int) -> None:
     view = _view(heading)
     pairs = [(skeleton, truths[match]) for skeleton, match in zip(chosen, matches, strict=True) if match >= 0]
     true_view = _view(heading + _turn(pairs))
+    circles = ""
     for axis, skeleton, match in zip(axes, chosen, matches, strict=True):
         base = skeleton.positions[Joint.SPINE_BASE]
         if match >= 0:
@@ -221,12 +225,14 @@ def _draw_person(figure: Any, tracked: Tracked, start_ns: int) -> None:
         points = (skeleton.positions - base) @ view.T
         _draw_bones(axis, points)
         unseen = points[skeleton.states != TrackingState.TRACKED]
-        axis.plot(*unseen.T, "o", color="white", markeredgecolor="red", markersize=4.5)
+        if np.isfinite(unseen).any():
+            axis.plot(*unseen.T, "o", color="white", markeredgecolor="red", markersize=4.5)
+            circles = "; circles: not tracked by any sensor"
         axis.set_title(f"{(skeleton.stamp_ns - start_ns) / NANOSECONDS:.1f} s", fontsize=9)
         axis.set_aspect("equal")
         axis.axis("off")
-    grey = ", truth grey (moved and turned onto the estimate)" if pairs else ""
-    figure.supxlabel(f"left blue, right orange{grey}; circles: not tracked by any sensor", fontsize=8)
+    grey = "truth grey (moved and turned onto the estimate)" if pairs else ""
+    figure.supxlabel(f"{grey}{circles}".removeprefix("; "), fontsize=8)
 
 
 def _draw_bones(axis: Any, points: FloatArray, **style: Any) -> None:

@@ -137,7 +137,8 @@ class Report:
         shown = "".join(f'<h2>{html.escape(caption)}</h2>\n<img alt="" src="{data}">\n' for caption, data in pictures)
         return f"""<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><title>{title}</title>
-<style>body {{ max-width: 1250px; margin: auto; }} h2 {{ font: 16px sans-serif; }} img {{ max-width: 100%; }}</style>
+<style>body {{ max-width: 1250px; margin: auto; padding: 1em; }}
+ h2 {{ font: 16px sans-serif; }} img {{ max-width: 100%; }}</style>
 </head><body><h1>{title}</h1>
 <pre>{html.escape(self.lines())}</pre>
 {shown}<pre>{html.escape(self.text())}</pre>

@@ -9,12 +9,9 @@ import numpy as np
 
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.evaluation.metrics import angle_errors, wrapped
-from body_tracking.evaluation.pictures import are_fine, draw
+from body_tracking.evaluation.pictures import ENOUGH, are_fine, draw
 from body_tracking.evaluation.reading import AngleSeries, EvaluationError, read, true_at
 from body_tracking.evaluation.report import Column, Table, make_folder
-
-_ENOUGH = 0.02
-"""Least share of the frames for statistics of an angle's error."""
 
 
 def summary(angles: AngleSeries, truth: AngleSeries | None = None) -> Table:
@@ -25,19 +22,21 @@ def summary(angles: AngleSeries, truth: AngleSeries | None = None) -> Table:
         truth: at any stamps within 20 ms of the estimated ones; None omits its columns.
     """
     known, true = angles.known, true_at(angles, truth)
+    shares = np.isfinite(known).mean(axis=0)
+    known = np.where(shares >= ENOUGH, known, np.nan)
     final = np.array([next(iter(column[np.isfinite(column)][::-1]), np.nan) for column in known.T])
     columns = [
         *_range("", known),
         Column("final", "final", "deg", np.degrees(final)),
         Column("stddev", "stddev", "deg", np.degrees(np.median(angles.stddev, axis=0))),
-        Column("known", "finite", "%", 1e2 * np.isfinite(known).mean(axis=0)),
+        Column("known", "finite", "%", 1e2 * shares),
     ]
     error = wrapped(known - true)
     if np.isfinite(error).any():
         errors = angle_errors(known, true)
         within = np.where(np.isfinite(error), np.abs(error) <= 2.0 * angles.stddev, np.nan)
         share = np.nansum(within, axis=0) / np.maximum(errors.frames, 1)
-        scarce = errors.frames < _ENOUGH * len(known)
+        scarce = errors.frames < ENOUGH * len(known)
         columns += [
             *_range("true ", np.where(np.isfinite(error), true, np.nan)),
             Column("rms_error", "rms err", "deg", np.where(scarce, np.nan, np.degrees(errors.rmse))),
@@ -48,11 +47,9 @@ def summary(angles: AngleSeries, truth: AngleSeries | None = None) -> Table:
         columns = [each._replace(digits=3) if each.unit == "deg" else each for each in columns]
     note = "stddev: median" + (", inf if unknown in most frames" if np.isinf(columns[3].values).any() else "")
     note += ". final: the last one that is known. finite: share of the frames with an angle, however large its stddev."
+    note += "\n-: known in less than 2 % of the frames."
     if np.isfinite(error).any():
-        note += (
-            "\nFrom true min on: of frames with a truth, errors where an angle is known in 2 % of the frames or more. "
-            "in 2 sd: errors within two stddev; 95 % is ideal."
-        )
+        note += " From true min on: of frames with a truth. in 2 sd: errors within two stddev; 95 % is ideal."
     return Table("angles", "angle", angles.names, tuple(columns), note)
 
 

@@ -35,7 +35,7 @@ from body_tracking.node_parameters import parameters_for
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.shared import names_in
 from body_tracking.pipeline.system import NodeSpec, Options
-from body_tracking.recording.finding import advice_for
+from body_tracking.recording.finding import advice_for, unused
 from body_tracking.recording.rig import RigReader
 from body_tracking.robot.system import convention_of
 from body_tracking.ros import dds
@@ -598,6 +598,11 @@ def supervise(
     """
     options = options_for(args, found)
     specs = nodes_for(options)
+    if args.bag is not None:
+        with RigReader(args.bag) as reader:
+            others = unused({name: each.type_name for name, each in reader.topics.items()}, options)
+        if others:
+            print(f"also in the recording, not taken without an option: {others}", flush=True)
     try:
         from body_tracking.ros.graph_monitor import GraphMonitor
     except ImportError as error:

@@ -101,12 +101,12 @@ def test_the_note_explains_the_columns_that_are_there() -> None:
     assert "in 2 sd:" in summary(angles, series([11.0, 20.0], [0.0, 0.0])).note
 
 
-def test_an_angle_known_in_single_frames_has_no_statistics_of_its_errors() -> None:
+def test_an_angle_known_in_single_frames_has_no_statistics() -> None:
     estimates = np.full(200, np.nan)
     estimates[:2] = 90.0
     rare = summary(series(list(estimates), [1.0] * 200), series([0.0] * 200, [0.0] * 200)).row("knee")
-    assert rare["max"] == 90.0
-    assert np.isnan([rare["rms_error"], rare["max_error"], rare["within_2_stddev"]]).all()
+    assert rare["known"] == 1.0
+    assert np.isnan([rare[name] for name in ("min", "max", "final")]).all() and "rms_error" not in rare
 
 
 def test_the_trunk_has_no_side_although_its_names_end_with_directions() -> None:
