@@ -51,6 +51,12 @@ _INITIAL_TARGET: Final = np.array([2.2, 0.0, 0.0])
 """Point at which the camera looks before a person is seen: in front of the reference sensor, metres in world."""
 _CAMERA_OFFSET: Final = np.array([-3.3, 1.5, 0.9])
 """From the target to the camera's initial position, metres: behind the sensor, to its side and above it."""
+_FIELD: Final = float(np.radians(45.0))
+"""Vertical angle of view."""
+_ARMS: Final = 1.1
+"""Metres from the middle of a person with raised arms that are in view, also in a narrow scene ..."""
+_FARTHEST: Final = 4.0
+"""... but from no farther away than so many times :data:`_CAMERA_OFFSET`."""
 
 LAYERS: Final[Mapping[str, tuple[str, bool]]] = {
     "sensors": ("skeletons of sensors", True),
@@ -140,7 +146,7 @@ class Page:
         scene.set_up_direction("+z")
         self._server.initial_camera.position = tuple(_INITIAL_TARGET + _CAMERA_OFFSET)
         self._server.initial_camera.look_at = tuple(_INITIAL_TARGET)
-        self._server.initial_camera.fov = float(np.radians(45.0))
+        self._server.initial_camera.fov = _FIELD
         self._grid = scene.add_grid(
             "/floor",
             12.0,
@@ -256,8 +262,11 @@ class Page:
 
     def _look_at_person(self, client: viser.ClientHandle) -> None:
         target = self._target
+        # the browser has not yet made room for the panels
+        aspect = max(client.camera.image_width - 2 * WIDTH, 1) / max(client.camera.image_height, 1)
+        half_width = float(np.linalg.norm(_CAMERA_OFFSET) * np.tan(_FIELD / 2.0)) * aspect
         with client.atomic():
-            client.camera.position = target + _CAMERA_OFFSET
+            client.camera.position = target + min(max(1.0, _ARMS / half_width), _FARTHEST) * _CAMERA_OFFSET
             client.camera.look_at = target
 
     # --- panels
@@ -315,6 +324,7 @@ class Page:
     def draw_end(self, statuses: Mapping[str, NodeStatus]) -> None:
         """Show that the graph has ended; the text stays in the browsers."""
         self._panel.draw(statuses, 0.0, ended=True)
+        self._table.content = "ended with the graph"
         self._server.flush()
         time.sleep(_LAST_S)
 
