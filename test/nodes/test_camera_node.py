@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not installed")
 
-from running import ROOT
+from running import ROOT, Running
 
 from body_tracking.messages.cdr import decode_skeletons
 from body_tracking.pipeline import graph
@@ -37,3 +37,12 @@ def test_images_become_skeletons_and_angles_with_deviations(tmp_path: Path) -> N
         skeletons = [decode_skeletons(raw.cdr) or () for raw in reader.messages(topics[:1])]
     assert counts[topics[0]] >= 29 and all(len(each) == 1 for each in skeletons)
     assert counts[topics[1]] == counts[topics[2]] >= 25
+
+
+@pytest.mark.skipif(bool(MISSING), reason=REASON)
+def test_a_driver_that_does_not_run_is_reported_with_the_topics_that_are_missing(tmp_path: Path) -> None:
+    with Running(tmp_path) as running:
+        running.start("camera_skeleton", cameras='["camera1"]', driver="realsense")
+        assert running.until(lambda: running.said("camera_skeleton").get("level") == "1", timeout=60.0)
+    text = running.said("camera_skeleton")[""]
+    assert text.startswith("nothing arrives on ") and "/camera/camera1/color/image_raw" in text
