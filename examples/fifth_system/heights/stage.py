@@ -10,6 +10,7 @@ import numpy as np
 from body_tracking.core.message_types import IMAGE
 from body_tracking.core.parameters import Parameter, Value
 from body_tracking.core.qos import RELIABLE as RELIABLE_QOS
+from body_tracking.core.skeleton import Joint
 from body_tracking.messages.base import to_header, to_nanoseconds
 from body_tracking.messages.codecs import Codec, Wire
 from body_tracking.pipeline import graph
@@ -54,5 +55,5 @@ class HeightStage(Stage):
 
     def take(self, topic: str, payload: Any, now: Now) -> Iterable[Output]:
         up = payload[0].positions[:, 2]
-        height = float(np.nanmax(up) - np.nanmin(up)) + float(str(self.values["margin"]))
+        height = float(up[Joint.HEAD] - np.nanmin(up)) + float(str(self.values["margin"]))
         yield Output(HEIGHT, (payload[0].stamp_ns, height), payload[0].stamp_ns)

@@ -30,6 +30,10 @@ SYSTEM = System(
     nodes=(NodeType("heights", Place.CONSUMER, "heights.stage:HeightStage"),),
     specs=_specs,
     options=(Option("height_margin", 0.1, "metres above the head", "METRES", parameter=("heights", "margin")),),
-    topics=(TopicSpec(HEIGHT, IMAGE, RELIABLE, "heights", "one pixel, `32FC1`: metres from the lowest joint up"),),
+    topics=(
+        TopicSpec(
+            HEIGHT, IMAGE, RELIABLE, "heights", "one pixel, `32FC1`: metres from the lowest joint to above the head"
+        ),
+    ),
     layers=(Layer("heights", "height", HEIGHT, "heights.stage:Height", "heights.layer:draw"),),
 )
