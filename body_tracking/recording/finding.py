@@ -24,8 +24,8 @@ SETUPS: Final[Mapping[str, Mapping[str, Value]]] = {
 
 _CAMERAS: Final = ("--camera", "--camera-rig", "--depth", "--marker-setup")
 _BALLS: Final = "/balls"
-_ESTIMATED: Final = "/imu/"
-"""Topics of orientations that the graph estimates, of the same type as those of sensors."""
+_ESTIMATED: Final = ("/imu/", "/humans/")
+"""Topics of what the graph estimates, of the same types as those of sensors."""
 _BY_TYPE: Final[Mapping[str, tuple[str, ...]]] = {
     IMAGE: _CAMERAS,
     COMPRESSED_IMAGE: _CAMERAS,

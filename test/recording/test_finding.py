@@ -41,6 +41,7 @@ def test_estimates_are_no_sources() -> None:
         "/filtered/skeleton": POINT_CLOUD,
         "/imu/forearm_left/orientation": IMU,
         "/humans/bodies/body1/joint_states": JOINT_STATE,
+        "/humans/height": IMAGE,
     }
     assert unused(estimated, {}) == advice_for(estimated) == ""
 
