@@ -124,7 +124,8 @@ def find_boards(board: Chessboard | CharucoBoard, images: Sequence[Sequence[Imag
             if found is not None:
                 parts.append((camera, view, *found))
     if not parts:
-        raise CalibrationError("the board is in none of the images")
+        hint = "; columns and rows count the inner corners, not the squares" if isinstance(board, Chessboard) else ""
+        raise CalibrationError(f"the board is in none of the images{hint}")
     counts = [len(numbers) for _, _, numbers, _ in parts]
     return Corners(
         np.repeat(np.array([camera for camera, *_ in parts], dtype=np.intp), counts),

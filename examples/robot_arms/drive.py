@@ -139,7 +139,8 @@ class Arm(Node):
 def report(arm: Arm) -> str:
     """A table of how each joint followed its commands."""
     times, told, stood = np.array(arm.times), np.array(arm.told), np.array(arm.stood)
-    lines = [f"{'joint':<10} {'from':>7} {'to':>7} {'rms error':>10} {'behind':>8}   (degrees, ms)"]
+    heads = f"{'joint':<10} {'from':>7} {'to':>7} {'rms error':>10} {'behind':>8}"
+    lines = [f"{heads}   (the arm against its commands; degrees, ms)"]
     for column, name in enumerate(arm.mapping.joints):
         errors = []
         for delay in COMPARED_DELAYS:

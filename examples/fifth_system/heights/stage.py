@@ -55,5 +55,7 @@ class HeightStage(Stage):
 
     def take(self, topic: str, payload: Any, now: Now) -> Iterable[Output]:
         up = payload[0].positions[:, 2]
+        if not np.isfinite(up[[Joint.FOOT_LEFT, Joint.FOOT_RIGHT]]).any():
+            return  # of a filter without legs
         height = float(up[Joint.HEAD] - np.nanmin(up)) + float(str(self.values["margin"]))
         yield Output(HEIGHT, (payload[0].stamp_ns, height), payload[0].stamp_ns)
