@@ -19,10 +19,6 @@ _READ: Final = 1000
 """Number of messages read per person, evenly over the bag; at most twice this number."""
 
 
-_MUCH = 5.0
-"""Difference of two shares, in percent, by which an angle is known much less often than another."""
-
-
 def summary(path: Path) -> Iterator[str]:
     """A line for each sensor with a pose, and for each limb of each person with angles.
 
@@ -85,6 +81,6 @@ def _angles(bag: BagReader, body: str) -> Iterator[str]:
         if medians:
             size = " to ".join(dict.fromkeys((f"{min(medians):.1f}", f"{max(medians):.1f}")))
             least = min(shares, key=lambda name: shares[name])
-            among = f" ({least} least often)" if max(shares.values()) - shares[least] > _MUCH else ""
-            text += f", each in at least {shares[least]:.0f} % of the frames{among}; median {size} deg"
+            rare = f" ({least} least often)" if round(shares[least]) < round(max(shares.values())) else ""
+            text += f", each in at least {shares[least]:.0f} % of the frames{rare}; median {size} deg"
         yield text + (f"; not {', '.join(unknown)}" if unknown else "")

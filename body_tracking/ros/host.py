@@ -16,17 +16,16 @@ from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.parameters import Value
 from body_tracking.core.qos import Qos, request_for
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
-from body_tracking.pipeline.system import Place
 from body_tracking.ros.bag_topics import UnknownTypeError, from_profile, message_class, to_profile
 from body_tracking.ros.main import run
 from body_tracking.ros.node import STEADY, GraphNode
 from body_tracking.ros.wire import WIRE
-from body_tracking.systems import NODES, stage_class
+from body_tracking.systems import stage_class
 
 _LOOK_S = 0.1
 """Seconds between two checks of the published topics."""
 _SILENT_S = 3.0
-"""Seconds without a message from which a node of a camera says that nothing arrives."""
+"""Seconds without a message from which a node says that nothing of a driver arrives."""
 _SAVE_S = 2.0
 """Seconds between two writes of the stage's state to disk."""
 
@@ -192,16 +191,17 @@ class StageNode(GraphNode):
 
     def state(self) -> tuple[int, str, dict[str, object]]:
         level, text, values = self.stage.state(self.now_ns())
-        if not level and self._is_without_images():
-            level, text = 1, f"nothing arrives on {', '.join(self.inputs)}"
+        if not level and (silent := self._silent_drivers()):
+            level, text = 1, f"nothing arrives on {', '.join(silent)}"
         self.log_events()
         return level, text, {**self.stage.counters, **values}
 
-    def _is_without_images(self) -> bool:
-        """Whether a camera's driver does not run, or publishes elsewhere; the topics of a bag are checked before."""
-        if NODES[self.NAME].place != Place.IMAGES or self.get_parameter("use_sim_time").value:
-            return False
-        return not self.monitor.totals["received"] and time.monotonic() - self._started > _SILENT_S
+    def _silent_drivers(self) -> list[str]:
+        """The topics of other packages' drivers, of none of which anything has arrived; a bag's are checked before."""
+        started = time.monotonic() - self._started > _SILENT_S
+        if self.monitor.totals["received"] or not started or self.get_parameter("use_sim_time").value:
+            return []
+        return [topic for topic, (port, _) in self.inputs.items() if port.foreign]
 
     def close(self) -> None:
         try:

@@ -300,14 +300,9 @@ class Page:
         return f"<div style='font-size:0.8em;padding:0.3em 0.6em'>{dots}</div>"
 
     def _checkbox(self, layer: str, label: str, shown: bool) -> Any:
-        checkbox = self._server.gui.add_checkbox(label, shown)
-
-        @checkbox.on_update
-        def _(event: viser.GuiEvent[Any]) -> None:
-            self.visible[layer] = checkbox.value
-
-        handle: Any = checkbox
-        return handle
+        checkbox: Any = self._server.gui.add_checkbox(label, shown)
+        checkbox.on_update(lambda _: self.visible.update({layer: checkbox.value}))
+        return checkbox
 
     # --- slow updates
 

@@ -32,7 +32,7 @@ def serve(host: str, port: int) -> viser.ViserServer:
         raise PageError(f"host {host!r}: cannot listen there ({error.strerror or error})") from error
     with same_origin(), redirect_stdout(StringIO()):  # viser prints a banner
         server = viser.ViserServer(host, port, label="body_tracking", verbose=False)
-    # what a proxy or a scanner asks for is no error of ours, of which it prints a traceback each time
+    # it prints a traceback for each request of a proxy or a scanner that is no page and no websocket
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=PALETTE[0])
     return server

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from body_tracking.camera.lifting import is_flat, lift, trunk_depth
+from body_tracking.camera.lifting import Lifted, is_flat, lift, trunk_depth
 from body_tracking.camera.pose_model import Landmark, Landmarks, Region
 from body_tracking.core.camera import Camera
 from body_tracking.core.skeleton import FloatArray, Joint, SingleArray, TrackingState
@@ -78,12 +78,18 @@ def test_joints_lie_behind_the_surface_at_their_landmarks_and_left_is_left() -> 
     assert np.isnan(body.positions[Joint.HAND_TIP_LEFT]).all() and body.states[Joint.THUMB_LEFT] == 0
 
 
-def test_covariances_are_positive_and_longest_along_the_line_of_sight_where_depth_is_guessed() -> None:
+def lifted_with_guess(landmark: Landmark) -> Lifted:
+    """The body of :func:`person`, one of whose landmarks the network guesses."""
     found, depth = person()
-    guessed = found.visible.copy()
-    guessed[Landmark.ANKLE_LEFT] = 0.1
-    body = lift(replace(found, visible=guessed), depth, CAMERA)
+    visible = found.visible.copy()
+    visible[landmark] = 0.1
+    body = lift(replace(found, visible=visible), depth, CAMERA)
     assert body is not None
+    return body
+
+
+def test_covariances_are_positive_and_longest_along_the_line_of_sight_where_depth_is_guessed() -> None:
+    body = lifted_with_guess(Landmark.ANKLE_LEFT)
     assert body.states[Joint.ANKLE_LEFT] == TrackingState.INFERRED
     values, vectors = np.linalg.eigh(body.covariances[Joint.ANKLE_LEFT])
     assert (values > 0.0).all()
@@ -95,11 +101,7 @@ def test_covariances_are_positive_and_longest_along_the_line_of_sight_where_dept
 
 def test_a_guessed_arm_is_unknown() -> None:
     """Its depth would be wrong by tenths of a metre for seconds, and with it the angle of the elbow."""
-    found, depth = person()
-    guessed = found.visible.copy()
-    guessed[Landmark.WRIST_LEFT] = 0.1
-    body = lift(replace(found, visible=guessed), depth, CAMERA)
-    assert body is not None
+    body = lifted_with_guess(Landmark.WRIST_LEFT)
     for joint, state in {"WRIST_LEFT": 0, "HAND_LEFT": 0, "ELBOW_LEFT": 2, "WRIST_RIGHT": 2}.items():
         assert body.states[Joint[joint]] == state and np.isfinite(body.positions[Joint[joint]]).all() == (state > 0)
 
