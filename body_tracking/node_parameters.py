@@ -42,17 +42,18 @@ def parameters_for(
             spec.name: {**spec.defaults, **(defaults or {}).get(spec.name, {}), **spec.parameters} for spec in specs
         }
     possible = {spec.name: spec for spec in (*absent, *specs)}
-    tables = {name: {item.name: item for item in parameters_of(spec.executable)} for name, spec in possible.items()}
+    tables = {spec.name: _table([spec]) for spec in specs}
     sections = read_file(file)
     for pattern, values in sections.items():
         about = [spec for spec in possible.values() if spec.in_section(pattern)]
         if not about:
             there = ", ".join(spec.full_name for spec in possible.values())
             raise ParameterError(f"{file}: {pattern}: no such node; there are {there}")
-        known: dict[str, Parameter] = {}
-        for spec in about:
-            known |= tables[spec.name]
-        _check(known.values(), {n: v for n, v in values.items() if not is_ros_own(n)}, f"{file}: {pattern}")
+        given_here = {name: value for name, value in values.items() if not is_ros_own(name)}
+        known = _table(spec for spec in about if spec.name in tables)
+        if not given_here.keys() <= known.keys():  # of absent nodes, whose modules take a second to import
+            known = _table(about)
+        _check(known.values(), given_here, f"{file}: {pattern}")
     result: dict[str, dict[str, Value]] = {}
     for spec in specs:
         given: dict[str, object] = {**spec.defaults, **((defaults or {}).get(spec.name) or {})}
@@ -65,6 +66,11 @@ def parameters_for(
         checked = _check(tables[spec.name].values(), given, f"{file}: {spec.full_name}")
         result[spec.name] = {**own, **{name: checked[name] for name in given}}
     return result
+
+
+def _table(specs: Iterable[NodeSpec]) -> dict[str, Parameter]:
+    """The parameters of all these nodes, by name."""
+    return {item.name: item for spec in specs for item in parameters_of(spec.executable)}
 
 
 def _check(table: Iterable[Parameter], given: Mapping[str, object], where: str) -> dict[str, Value]:
