@@ -57,10 +57,10 @@ def heights(bag: Path, margin: float) -> dict[int, float]:
     return found
 
 
-def test_a_folder_is_a_system_live_and_offline(tmp_path: Path, wave: Path) -> None:
-    command("body_tracking.cli", "replay", wave, "-o", tmp_path / "offline")
+def test_a_folder_is_a_system_live_and_offline(tmp_path: Path, t_pose: Path) -> None:
+    command("body_tracking.cli", "replay", t_pose, "-o", tmp_path / "offline")
     offline = heights(tmp_path / "offline", 0.1)
-    words = ("--bag", wave, "--record", tmp_path / "live", "--height-margin", "0.2", "--reliable")
+    words = ("--bag", t_pose, "--record", tmp_path / "live", "--height-margin", "0.2", "--reliable")
     assert "heights" in command("body_tracking.cli", "up", *words, "--log-dir", tmp_path).splitlines()[0]
     live = heights(tmp_path / "live", 0.2)
     assert len(offline) > 100 and len(live) > 0.7 * len(offline)
