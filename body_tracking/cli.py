@@ -7,9 +7,9 @@ import importlib
 import os
 import sys
 from collections.abc import Sequence
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from body_tracking import __version__
 from body_tracking.core.errors import BodyTrackingError
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
         "and the same chain offline over recordings.",
         epilog="body_tracking COMMAND --help prints the options of a command; body_tracking alone says what to do.",
     )
-    top.add_argument("--version", action="version", version=f"body_tracking {version('body_tracking')}")
+    top.add_argument("--version", action="version", version=f"body_tracking {__version__}")
     subparsers = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
     commands = subcommands()
     if command in commands:
