@@ -54,7 +54,7 @@ class Wrists(Running):
             for segment in FOREARMS
         )
         self.bag = folder / "bag"
-        write_bag(simulate(Setup("forearm_rolling", around((0.0,)), imus=imus, seed=3, seconds=11.0)), self.bag)
+        write_bag(simulate(Setup("forearm_rolling", around((0.0,)), imus=imus, seed=3, seconds=9.7)), self.bag)
         self.orientations = {segment: self.collect(Imu, graph.orientation_topic(segment)) for segment in FOREARMS}
         self.skeletons = self.collect(PointCloud2, graph.IMU_SKELETON)
         self.angles = self.collect(JointState, graph.joint_states_topic("body1"))

@@ -99,14 +99,14 @@ class Arm:
 
 
 class Robots(Running):
-    """Two arms in this process that follow their commands."""
+    """Arms in this process that follow their commands."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *robots: str) -> None:
         super().__init__(folder)
         names = {name: angle_names(name) for name in ALL_CONVENTIONS}
         self.arms: dict[str, Arm] = {}
         self.states: dict[str, Any] = {}
-        for robot in BODIES:
+        for robot in robots:
             mapping = load(mapping_file(robot), names)
             model = ROOT / "examples" / "robot_arms" / f"{robot}.xml"
             arm = self.arms[robot] = Arm(mapping, SimulatedArm(model, mapping.joints, mapping.home))
@@ -152,9 +152,9 @@ class PlayedRobots(Robots):
     """Arms with a ``robot_commands`` node each, and a player in place of the graph."""
 
     def __init__(self, folder: Path) -> None:
-        super().__init__(folder)
+        super().__init__(folder, *BODIES)
         self.bag = folder / "angles"
-        write_angles(self.bag)
+        write_angles(self.bag, 12.0)  # in a loop; both arms move after half of it
         self.start("calibration", sensors="[kinect1]", use_sim_time=True)
         # One goes by the wall clock and stamps its commands by it: its person's angles are stamped anew. The other goes
         # by /clock, which ends with the player.
@@ -377,7 +377,7 @@ def following(log: str) -> list[tuple[float, float]]:
 
 @pytest.mark.alone
 def test_an_arm_follows_two_sensors_through_the_whole_graph_and_holds_when_they_die(tmp_path: Path) -> None:
-    with Robots(tmp_path) as robots:
+    with Robots(tmp_path, "two_joint_arm") as robots:
         arm = robots.arms["two_joint_arm"]
         angles: list[tuple[float, JointState]] = []
         topic = graph.joint_states_topic("body1")
