@@ -295,6 +295,8 @@ def test_a_recording_plays_as_it_was_recorded(tmp_path: Path) -> None:
 
 
 CAMERA = """
+import time
+
 import numpy as np
 
 from body_tracking.core.sources import RecordedFrame
@@ -324,7 +326,9 @@ class Mute(Camera):
         raise KeyError("temperature")
 
     def read(self, timeout):
-        return super().read(timeout) if self.stamps.__length_hint__() else None
+        if self.stamps.__length_hint__():
+            return super().read(timeout)
+        time.sleep(timeout)
 
     def close(self):
         raise OSError("closed twice")

@@ -154,7 +154,7 @@ class Robot:
 
 
 class Bench:
-    """All robots, their nodes in a thread each, and the inputs of the nodes at 30 Hz."""
+    """All robots, their nodes in a thread each until the next robot's turn, and the inputs of the nodes at 30 Hz."""
 
     def __init__(self, folder: Path) -> None:
         files = {name: mapping(name, folder, state=state) for name, state in ROBOTS.items()}
@@ -174,7 +174,9 @@ class Bench:
         self._active: Robot | None = None
 
     def robot(self, name: str) -> Robot:
-        """A robot that receives angles from now on, instead of the one before."""
+        """A robot that receives angles from now on, instead of the one before, whose node ends."""
+        if self._active is not None:
+            self.end(self._active.node)
         self._active = self._robots[name]
         return self._active
 
