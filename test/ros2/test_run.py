@@ -1,7 +1,4 @@
-"""``ros2 run`` of every node, and ``ros2 service call`` of services of docs/reference.md, all in ``make test-all``.
-
-In ``make test``, nodes that ``ros2 launch`` starts in ``test_launch.py`` are left out.
-"""
+"""``ros2 run`` of every node, and ``ros2 service call`` of services of docs/reference.md, all in ``make test-all``."""
 
 from __future__ import annotations
 
@@ -11,7 +8,7 @@ import pytest
 from tools import Tool, Tools
 
 from body_tracking import systems
-from draws import ALL, some
+from draws import some
 from pose_networks import startable
 
 MARKER_NODES = (
@@ -23,10 +20,8 @@ MARKER_NODES = (
 )
 LACKING = ("robot_commands", "bag_player", "kinect_skeleton", "mesh_tracker", "camera_skeleton", "camera_rig")
 """Nodes that do nothing without a parameter."""
-LAUNCHED = ("calibration", "fusion", "skeleton_filter", "joint_angles", "bag_player", "camera_skeleton")
-"""Nodes whose installed executables ``test_launch.py`` starts, calls and ends in ``make test``, too."""
-NODES = [name for name in startable(systems.EXECUTABLES) if ALL or name not in LAUNCHED]
-GROUPS = 4 if ALL else 3
+NODES = startable(systems.EXECUTABLES)
+GROUPS = 4
 """Groups of nodes that run at the same time: the time in which n nodes find each other grows with the square of n."""
 
 
