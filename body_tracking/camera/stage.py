@@ -89,6 +89,7 @@ class CameraStage(Stage):
 
     def __init__(self, values: Mapping[str, Value], wanted: Callable[[str], bool] = lambda topic: True) -> None:
         super().__init__(values, wanted)
+        prepare()
         names = tuple(check_sensor_name(each) for each in names_in(values["cameras"]))
         if not names or len(set(names)) < len(names):
             raise graph.GraphError(f"cameras: {', '.join(names) or 'none'}; expected one or more, each once")
@@ -123,11 +124,6 @@ class CameraStage(Stage):
         self.outputs = tuple(
             Port(graph.skeleton_topic(name), Skeletons(), skeleton_qos(values), measured=True) for name in names
         ) + tuple(port for camera in self._cameras.values() for port in camera.pictures.ports)
-
-    def start(self, now: Now) -> Iterable[Output]:
-        """Compile or load the loops: not when ``up`` asks for the topics, before it starts any node."""
-        prepare()
-        return ()
 
     def take(self, topic: str, payload: Any, now: Now) -> Iterable[Output]:
         camera, what = self._by_topic[topic]
