@@ -66,13 +66,18 @@ def best_estimate(pairs: Pairs, starts: Iterable[Pose]) -> PairEstimate | None:
     Returns:
         The estimate of lowest cost; None where none could be made.
     """
-    found: list[tuple[float, PairEstimate]] = []
+    found: list[tuple[float, bool, PairEstimate]] = []
     for rotation, translation in starts:
         same = same_sense(pairs.reference, pairs.sensor @ rotation.T)
         try:
             judged = estimate(with_sides_swapped(pairs, ~same), rotation, translation)
-            kept = judged if same.mean() < MIN_SAME else estimate(pairs, judged.rotation, judged.translation)
         except CalibrationError:
             continue
-        found.append((judged.cost + DISAGREEMENT * float(np.count_nonzero(~same)), kept))
-    return min(found, key=lambda each: each[0])[1] if found else None
+        cost = judged.cost + DISAGREEMENT * float(np.count_nonzero(~same))
+        found.append((cost, bool(same.mean() < MIN_SAME), judged))
+    for _, turned, judged in sorted(found, key=lambda each: each[0]):
+        try:
+            return judged if turned else estimate(pairs, judged.rotation, judged.translation)
+        except CalibrationError:
+            continue
+    return None

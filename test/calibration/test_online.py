@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
@@ -88,7 +89,7 @@ def test_real_pairs_are_calibrated_to_the_taped_marks(shared_data: Path, name: s
         assert np.degrees(relative_yaw(update.result, "kinect2")) == pytest.approx(nominal, abs=3.0)
 
 
-@pytest.mark.parametrize(("name", "offset", "ppm"), some([("p02_90deg", -2.0, -100.0), ("p12_parallel", 2.0, 100.0)]))
+@pytest.mark.parametrize(("name", "offset", "ppm"), some([("p12_90deg", -2.0, -100.0), ("p12_parallel", 2.0, 100.0)]))
 def test_a_known_motion_and_clock_are_recovered(shared_data: Path, name: str, offset: float, ppm: float) -> None:
     """To 5 mm, 0.3 degrees and 5 ms against the result without them."""
     frames = recording(shared_data / "kinect_pairs" / f"{name}.csv.gz")[: draws(1500, 10_000)]
@@ -242,7 +243,7 @@ def test_a_sensor_that_sees_the_body_turned_around_does_not_turn_the_pose(turned
 
 
 def test_a_pose_half_a_turn_off_is_put_right_at_once() -> None:
-    calibration, updates = run(stream(15.0), saved=saved_after(15.0, turned=175.0))
+    calibration, updates = run(stream(8.0), saved=saved_after(turned=175.0))
     assert not any(5.0 < yaw_error(update.result) < 170.0 for update in updates)
     assert yaw_error(calibration.current_update().result) < 5.0
 
@@ -262,7 +263,7 @@ def test_a_joint_that_nobody_ever_sees_is_no_reason_to_warn() -> None:
 
 
 def test_somebody_who_never_stands_still_is_enough() -> None:
-    calibration, _ = run(stream(20.0, still=-5.0))
+    calibration, _ = run(stream(14.0, still=-5.0))
     assert any("without a still pose" in event for event in calibration.events)
     assert yaw_error(calibration.finish()) < 0.5
 
@@ -328,7 +329,7 @@ def test_an_update_holds_only_after_it_was_made() -> None:
     """Live and offline agree only if every update arrives before it comes into force."""
     calibration = OnlineCalibration(("kinect1", "kinect2"))
     assert calibration.current_update().valid_from_ns == 0
-    for sensor, skeleton, received in stream(15.0):
+    for sensor, skeleton, received in stream(15.0)[:540]:
         for update in calibration.push(sensor, skeleton, received):
             assert update.valid_from_ns >= skeleton.stamp_ns + 0.5 * NANOSECONDS
             assert {pose.valid_from_ns for pose in update.result.poses.values()} == {update.valid_from_ns}
@@ -369,14 +370,14 @@ def test_a_clock_that_was_saved_when_stamps_were_no_ros_time_is_never_used(offse
 
 
 def test_a_saved_clock_of_another_session_is_not_believed() -> None:
-    calibration, _ = run(stream(15.0, offset=-30.0), saved=saved_after())
+    calibration, _ = run(stream(12.0, offset=-30.0), saved=saved_after())
     assert calibration.result().clocks["kinect2"].offset == pytest.approx(-30.0, abs=0.02)
 
 
 def test_a_saved_clock_is_known_better_than_from_motion_that_looks_different_from_either_side() -> None:
     """And, as quartz drifts, for a limited time."""
     views = around(np.radians([45.0, -80.0]).tolist())
-    recording = simulate(Setup("torso_twist", views, seconds=20.0, seed=4, standard=True))
+    recording = simulate(Setup("torso_twist", views, seconds=14.0, seed=4, standard=True))
     clocks = {sensor.pose.sensor: sensor.clock for sensor in recording.sensors}
     names, true = tuple(clocks), clocks["kinect2"]
     poses = {sensor.pose.sensor: sensor.pose for sensor in recording.sensors}
@@ -421,7 +422,9 @@ def test_a_clock_that_was_set_since_it_was_saved_is_found_anew(offset: float) ->
 
 def test_a_looping_bag_keeps_the_poses_and_adds_no_information_on_the_clock() -> None:
     once = saved_after()
-    calibration, _ = run((*stream(15.0), *stream(15.0)))
+    calibration = copy.deepcopy(_walked(15.0))
+    for again in stream(15.0):
+        calibration.push(*again)
     twice = calibration.result()
     assert any("went back" in event for event in calibration.events)
     assert Rotation.from_matrix(between(twice)[0] @ between(once)[0].T).magnitude() < np.radians(0.5)
@@ -444,7 +447,7 @@ def test_a_clock_that_drifts_far_is_followed() -> None:
 
 
 def test_a_sensor_that_was_moved_since_is_found_where_it_is() -> None:
-    calibration, _ = run(stream(20.0), saved=saved_after(turned=20.0))
+    calibration, _ = run(stream(14.0), saved=saved_after(turned=20.0))
     assert any("does not stand where" in event for event in calibration.events)
     assert yaw_error(calibration.finish()) < 1.0
 
@@ -458,7 +461,7 @@ def test_a_calibration_of_another_reference_is_refused() -> None:
 
 
 def test_services_start_anew_and_reset() -> None:
-    calibration, _ = run(stream(15.0))
+    calibration = copy.deepcopy(_walked(15.0))
     before = calibration.result().poses["kinect2"].translation
     assert "stand still" in calibration.start()
     assert_allclose(calibration.result().poses["kinect2"].translation, before)  # it holds until the next
@@ -483,6 +486,6 @@ def broken(frames: tuple[tuple[str, Skeleton, int], ...]) -> Iterator[tuple[str,
 
 @pytest.mark.filterwarnings("error")
 def test_broken_frames_do_no_harm() -> None:
-    calibration, _ = run(tuple(broken(stream(15.0))))
+    calibration, _ = run(tuple(broken(stream(15.0)[:720])))
     assert yaw_error(calibration.finish()) < 1.0
     assert calibration.status()[2]["kinect2 late_frames"] > 0

@@ -295,7 +295,7 @@ def arm_elsewhere(rng: np.random.Generator) -> tuple[list[Joint], FloatArray]:
 def test_a_pose_that_jumps_states_how_far() -> None:
     """After a jump the deviations say that either pose may be wrong: a camera moves an arm elsewhere for 0.6 s."""
     jumps, misleading = 0, 0
-    for seed in range(draws(10, 60)):
+    for seed in range(draws(5, 60)):
         truth = random_truth(seed, 3.2)
         arm, offset = arm_elsewhere(np.random.default_rng([seed, 7]))
         estimator, angles = ExtendedKalmanFilter(), None
@@ -319,7 +319,7 @@ def test_a_pose_that_jumps_states_how_far() -> None:
 def test_one_sensor_that_sees_an_arm_elsewhere_does_not_move_it_there() -> None:
     """A camera at the side guesses a hidden arm; only that camera sees the hand, so that a new pose is searched for."""
     away, restarts = [], 0
-    for seed in range(draws(4, 20)):
+    for seed in range(draws(2, 20)):
         truth = random_truth(seed, 4.0)
         arm, offset = arm_elsewhere(np.random.default_rng([seed, 8]))
         estimator = ExtendedKalmanFilter()
@@ -376,7 +376,7 @@ def test_a_shoulder_that_rises_is_followed_although_its_joint_centre_is_offset()
     q[:, clavicles] = raised[:, None]
     stated = np.broadcast_to(np.eye(3), (N_JOINTS, 3, 3)) * BASE_STDDEV[:, None, None] ** 2
     followed = []
-    for seed in range(draws(4, 16)):
+    for seed in range(draws(2, 16)):
         rng = np.random.default_rng(70 + seed)
         points = np.full((len(times), N_JOINTS, 3), np.nan)
         points[:, POINTS] = MODEL.linearise(q, RandomPerson.draw(rng).lengths).posture.positions
@@ -445,7 +445,7 @@ def test_what_a_sensor_states_to_be_poor_does_not_count_as_good_because_it_was_g
     good = BASE_STDDEV[:, None, None] ** 2 * np.eye(3)
     away: tuple[list[float], list[float]] = [], []
     for seed in range(draws(4, 12)):
-        truth = random_truth(seed, 4.0)
+        truth = random_truth(seed, 3.2)
         rng = np.random.default_rng([seed, 9])
         offsets, direction = rng.normal(0.0, 0.015, (2, N_JOINTS, 3)), rng.normal(size=3)
         alone, both = ExtendedKalmanFilter(), ExtendedKalmanFilter()
