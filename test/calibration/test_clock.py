@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -13,6 +15,7 @@ from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from walkers import walk
 
 
+@cache
 def seen(offset: float, drift: float, seconds: float, seed: int, noise: float = 0.004) -> tuple[FloatArray, FloatArray]:
     """Stamps in a clock and noisy positions in some frame, of the same walk."""
     rng = np.random.default_rng(seed)
@@ -86,6 +89,7 @@ def offset_at(clock: ClockModel, time: float) -> float:
     return clock.offset_ns_at(round(time * NANOSECONDS)) / NANOSECONDS
 
 
+@cache
 def fitted(
     offset: float, drift: float, seconds: float = 55.0, expected: ClockModel | None = None, repeated: int = 1
 ) -> ClockModel:

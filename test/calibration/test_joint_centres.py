@@ -142,7 +142,7 @@ def test_errors_of_offsets_agree_with_their_covariance() -> None:
     rng = np.random.default_rng(3)
     rows = (3 * LEARNT[:, None] + np.arange(3)).reshape(-1)
     errors = []
-    for _ in range(400):
+    for _ in range(draws(150, 400)):
         points, offsets, transient = drawn(rng, offset_correlation())
         found = t_pose_offsets(points, transient)
         local = posed(points, EYE) @ offsets[:, :, None]
@@ -155,7 +155,8 @@ def test_errors_of_offsets_agree_with_their_covariance() -> None:
 def test_the_gate_passes_t_poses_whose_joints_have_independent_offsets() -> None:
     rng = np.random.default_rng(3)
     found = [
-        t_pose_offsets(points, transient) for points, _, transient in (drawn(rng, np.eye(N_JOINTS)) for _ in range(400))
+        t_pose_offsets(points, transient)
+        for points, _, transient in (drawn(rng, np.eye(N_JOINTS)) for _ in range(draws(150, 400)))
     ]
     assert 0.85 < np.mean([each.distance for each in found]) / found[0].dimension < 1.15
 
@@ -431,7 +432,7 @@ def test_the_spread_of_offsets_shrinks_and_turns_with_the_body() -> None:
 def test_real_movements_without_a_t_pose_are_not_taken_for_one(shared_data: Path) -> None:
     """Three people who stand, step, walk, reach and turn, by two real sensors each: thirteen minutes in all."""
     frames = 0
-    for path in some(sorted((shared_data / "kinect_pairs").glob("[op]*.csv.gz")), 4):
+    for path in some(sorted((shared_data / "kinect_pairs").glob("[op]*.csv.gz")), 2):
         counters: dict[str, int] = {}
         centres = JointCentres(counters)
         for frame in CsvRecording(path):

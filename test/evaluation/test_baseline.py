@@ -58,7 +58,7 @@ def few(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("few")
     for name, kind in (("arm", ArmScene), ("painted", Painted), ("blind", Blind)):
         write_arm(kind(), folder / name, rate=0.25)
-    write_pendulum(PendulumScene(0.25, camera=SMALL, diameter=0.04), folder / "pendulum", 6.0)
+    write_pendulum(PendulumScene(0.25, camera=SMALL, diameter=0.04), folder / "pendulum", 4.0)
     write_pendulum(PendulumScene(0.25, camera=SMALL, diameter=0.04, depth_at_ball=True), folder / "shiny", 1.0)
     write_pendulum(PendulumScene(0.25, camera=SMALL, diameter=0.04, seed=1), folder / "short", 1.0)
     return folder

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import html
+import io
 import json
 import re
 from pathlib import Path
@@ -30,6 +32,15 @@ def result(replayed_wave: Path, wave: Path) -> Evaluation:
     return evaluate(read_estimate(replayed_wave), read_truth(wave))
 
 
+@pytest.fixture(scope="module")
+def reported(replayed_wave: Path, wave: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
+    """What the command shows with ``-v``, and its page."""
+    page, shown = tmp_path_factory.mktemp("page") / "report.html", io.StringIO()
+    with contextlib.redirect_stdout(shown):
+        assert main(["evaluate", str(replayed_wave), "--truth", str(wave), "-v", "--html", str(page)]) == 0
+    return shown.getvalue(), page.read_text(encoding="utf-8")
+
+
 def bag_of(folder: Path, skeletons: int, topic: str = "/filtered/skeleton", kind: str = POINT_CLOUD) -> Path:
     """A bag with one topic and nothing else."""
     states = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
@@ -41,11 +52,8 @@ def bag_of(folder: Path, skeletons: int, topic: str = "/filtered/skeleton", kind
     return folder
 
 
-def test_the_table_holds_the_results(
-    replayed_wave: Path, wave: Path, result: Evaluation, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["evaluate", str(replayed_wave), "--truth", str(wave), "-v"]) == 0
-    shown = capsys.readouterr().out
+def test_the_table_holds_the_results(reported: tuple[str, str], result: Evaluation) -> None:
+    shown, _ = reported
     wrist = JOINT_NAMES.index("WristLeft")
     line = next(line for line in shown.splitlines() if line.startswith("WristLeft "))
     errors = result.comparisons[0].joints
@@ -102,12 +110,8 @@ def test_json_and_tables_agree(replayed_wave: Path, result: Evaluation, capsys: 
     assert set(reported["tables"]) == {table.key for table in tables(result)}
 
 
-def test_the_report_has_every_table_and_picture_in_one_file(
-    replayed_wave: Path, wave: Path, result: Evaluation, tmp_path: Path
-) -> None:
-    report = tmp_path / "report.html"
-    assert main(["evaluate", str(replayed_wave), "--truth", str(wave), "--html", str(report)]) == 0
-    shown = report.read_text(encoding="utf-8")
+def test_the_report_has_every_table_and_picture_in_one_file(reported: tuple[str, str], result: Evaluation) -> None:
+    _, shown = reported
     made = report_of(result)
     assert made.lines() in html.unescape(shown) and made.text() in html.unescape(shown)
     addresses = re.findall(r'<img alt="" src="data:image/png;base64,([A-Za-z0-9+/=]+)">', shown)

@@ -31,7 +31,7 @@ BAGS = Path(__file__).resolve().parents[2] / "bags"
 
 @pytest.fixture(scope="module")
 def made() -> Scene:
-    return scene(11, seconds=25.0, bias_deg=5.0)
+    return scene(11, seconds=18.0, bias_deg=5.0)
 
 
 @pytest.fixture(scope="module")

@@ -59,7 +59,7 @@ def test_sensors_on_an_arm_do_not_hide_how_the_person_twists(tmp_path: Path) -> 
     It shows in the first turns: later the filter has learnt the errors of its sources.
     """
     worn = ("forearm_left", "upper_arm_left")
-    imus = tuple(SimulatedImu(segment, segment, usual_mounting(segment), oriented=True) for segment in worn)
+    imus = tuple(SimulatedImu(segment, segment, usual_mounting(segment), 25.0, oriented=True) for segment in worn)
     squares = []
     for seed in range(8503, 8503 + draws(1, 4)):
         bag, out = tmp_path / f"bag{seed}", tmp_path / f"out{seed}"

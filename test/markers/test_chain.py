@@ -70,7 +70,7 @@ def test_the_order_of_the_description_does_not_matter() -> None:
 
 def test_a_joint_of_another_kind_is_named() -> None:
     rng, tree = upper_body(12)
-    frames = measured(rng, tree, random_posture(rng, tree, 80))
+    frames = measured(rng, tree, random_posture(rng, tree, 50))
     wrong = [DESCRIPTION[0], DESCRIPTION[1], JointDescription("neck", "torso", "head", JointKind.HINGE)]
     fit = fit_chain(frames, wrong)
     assert len(fit.warnings) == 1 and fit.warnings[0].startswith("neck: errors are")

@@ -113,7 +113,7 @@ def test_furniture_of_a_persons_size_is_lost_and_searches_take_turns_in_time(tra
 def test_a_person_who_walks_across_is_found_from_the_side_at_once_and_the_right_way_round() -> None:
     """Starts that face the camera find such a person in the end, and lose them in between."""
     body, wall, right = body_model.load().body(), np.full_like(NOTHING, 4.0), []
-    for side, elevation, flexion in some(list(itertools.product((-1.0, 1.0), (0.1, 0.15), (0.2, 0.4))), 4):
+    for side, elevation, flexion in some(list(itertools.product((-1.0, 1.0), (0.1, 0.15), (0.2, 0.4))), 2):
         tracker = MeshTracker(DepthCamera(recording().camera), body, np.eye(len(body.shape)))
         fitter = MeshFitter(body)
         tracker.update(0, wall)

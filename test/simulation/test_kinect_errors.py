@@ -209,7 +209,7 @@ def test_errors_grow_with_the_yaw_and_on_the_far_side_more(yaw: float, factor: f
 
 def test_drift_has_its_size_and_its_time() -> None:
     rate = 5.0
-    truth = still(900.0, rate=rate)
+    truth = still(draws(500, 900), rate=rate)
     positions, _ = see(only(drift=0.01, drift_time=1.6), truth, rate=rate, capsules=THIN)
     joint = Joint.SPINE_BASE
     errors = (positions - in_sight(truth))[:, joint] / (0.01 * SLOW_SCALE[joint] * np.array([1.0, 1.0, ALONG_RAY]))
@@ -223,7 +223,7 @@ def test_the_bias_returns_with_the_pose_and_is_of_the_stated_size() -> None:
     truth = np.concatenate([here, away, here])
     errors, unit = only(bias=0.01), []
     rng = np.random.default_rng(1)
-    for _ in range(150):
+    for _ in range(draws(60, 150)):
         misreading = Misreading.draw(rng)
         error = see(errors, truth, misreading=misreading, capsules=THIN)[0] - in_sight(truth)
         assert np.allclose(error[0, TRUNK], error[-1, TRUNK])
@@ -321,7 +321,7 @@ def test_left_and_right_change_beyond_the_side_view_and_back_later() -> None:
 
 def test_they_change_by_themselves_from_the_side_and_not_from_the_front() -> None:
     errors, rate = only(mirror_rate=0.1, mirror_time=1.0), 5.0
-    side, front = still(1200.0, np.pi / 2, rate=rate), still(60.0)
+    side, front = still(draws(600, 1200), np.pi / 2, rate=rate), still(draws(20, 60))
     found, _ = see(errors, side, rate=rate, capsules=THIN)
     # the person faces across the view: with its labels exchanged a hip is on the far side
     exchanged = ~np.isclose(found, in_sight(side))[:, Joint.HIP_LEFT].all(axis=1)
@@ -378,7 +378,7 @@ def test_guesses_have_their_size_and_only_hidden_joints_have_them() -> None:
 
 def test_the_parameter_is_the_share_of_hidden_joints_reported_as_tracked() -> None:
     errors = only(mislabelled=0.3, given_up=0.2, drift_time=0.5)
-    states = see(errors, hidden_arm(900.0, rate=3.0), rate=3.0)[1][:, Joint.WRIST_RIGHT]
+    states = see(errors, hidden_arm(draws(500, 900), rate=3.0), rate=3.0)[1][:, Joint.WRIST_RIGHT]
     shares = np.bincount(states, minlength=3) / len(states)
     assert shares == pytest.approx([0.2, 0.5, 0.3], abs=0.05)
 
@@ -430,7 +430,7 @@ def test_the_stated_share_of_frames_is_lost() -> None:
 
 def test_stalls_lose_the_frames_of_half_their_time() -> None:
     sensor = SimulatedKinect(POSE, errors=only(stall_rate=0.5, stall_time=0.2), dark=True)
-    times, stamps, _ = frames_of(sensor, 400.0)
+    times, stamps, _ = frames_of(sensor, draws(200, 400))
     # some stalls overlap
     assert 1.0 - len(stamps) / len(times) == pytest.approx(0.5 * 0.5 * 0.2, abs=0.02)
 
