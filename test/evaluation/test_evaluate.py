@@ -88,8 +88,10 @@ def test_a_dozen_lines_say_how_good_the_estimate_is(
     assert f"median RMS error {np.nanmedian(rms):.1f} mm, " in shown
 
 
-def test_the_lines_are_of_the_aligned_estimate_where_its_frame_is_another(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["evaluate", str(BAGS / "tpose_wave"), "--topic", "/kinect1/skeleton"]) == 0
+def test_the_lines_are_of_the_aligned_estimate_where_its_frame_is_another(
+    wave: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["evaluate", str(wave), "--topic", "/kinect1/skeleton"]) == 0
     shown = capsys.readouterr().out
     assert "joints    25, after alignment in time and space\n" in shown and "no standard deviations are stated" in shown
     assert "'as it is' compares 'kinect1_optical_frame' with 'world'" in shown
@@ -197,7 +199,7 @@ def test_a_topic_of_another_type_is_no_skeleton(tmp_path: Path, capsys: pytest.C
 
 
 def test_markers_have_a_clock_and_a_frame_of_their_own(
-    shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    shared_data: Path, wave: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """An estimate that is the markers' own joint centres, elsewhere, at another time, 30 times a second, with noise."""
     file = shared_data / "plug_in_gait" / "cgm__Test_Files__Movement_trial.c3d"
@@ -222,5 +224,5 @@ def test_markers_have_a_clock_and_a_frame_of_their_own(
     assert 10.0 < next(row for name, row in rows.items() if name.startswith("all"))["rms"] < 20.0
     assert rows["WristLeft"]["jitter"] == pytest.approx(10.0, rel=0.3)
     assert rows["WristLeft"]["off_track"] == 0.0
-    assert main(["evaluate", str(BAGS / "tpose_wave"), "--topic", "/kinect1/skeleton", "--truth", str(file)]) == 2
+    assert main(["evaluate", str(wave), "--topic", "/kinect1/skeleton", "--truth", str(file)]) == 2
     assert "do not show the same movement" in capsys.readouterr().err
