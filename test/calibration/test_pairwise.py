@@ -57,7 +57,7 @@ def test_the_stated_uncertainty_covers_the_error() -> None:
     stated = []
     for times, places, distortion in ((STILL, 1, 0.05), (WALK, 20, 0.05 / np.sqrt(6.0))):
         normalised = []
-        for seed in range(draws(12, 30)):
+        for seed in range(draws(8, 30)):
             pairs = pairs_of(times, distortion, seed=seed, places=places)
             found = estimate(pairs, ROTATION, TRANSLATION)
             turn = Rotation.from_matrix(ROTATION @ found.rotation.T).as_rotvec()

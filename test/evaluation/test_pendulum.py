@@ -60,7 +60,7 @@ def test_the_arc_gives_the_angle_whatever_the_distance_and_the_roll_of_the_camer
 
 def test_frequency_is_within_the_bar_for_every_seed() -> None:
     """10 % lost, times of capture and stamps that are off by 10 ms each, 0.2 pixels of noise, and single outliers."""
-    for seed in (*range(draws(4, 200)), 34, 155):  # in two of which an outlier bent the arc
+    for seed in (*range(draws(2, 200)), 34, 155):  # in two of which an outlier bent the arc
         rng = np.random.default_rng(seed)
         scene = PendulumScene(rng.uniform(0.25, 1.0), rng.uniform(0.05, 0.35), rng.uniform(0.0, 0.05))
         times = capture_times(20.0, rng)

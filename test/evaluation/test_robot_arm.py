@@ -82,7 +82,7 @@ def test_balls_are_found_where_they_are_and_nothing_else_red_is() -> None:
     """A red square hangs on the wall behind."""
     errors: list[float] = []
     numbers = []
-    for number, time in enumerate(np.linspace(0.0, SCENE.seconds, draws(4, 40))):
+    for number, time in enumerate(np.linspace(0.0, SCENE.seconds, draws(3, 40))):
         image, depth = SCENE.images(float(time), number)
         found = red_balls(image, to_metres(depth), SCENE.colour, SCENE.depth, RADIUS)
         true = (SCENE.balls(np.array([time]))[0] - SCENE.pose.translation) @ SCENE.pose.rotation

@@ -80,7 +80,7 @@ def test_it_equals_25_independent_filterpy_filters(model: str) -> None:
     singles = [KalmanFilter(dim_x=3 * order, dim_z=3) for _ in range(N_JOINTS)]
     stamp_ns, position = 1, BODY.copy()
     seen_before = np.ones(N_JOINTS, dtype=bool)
-    for frame in range(draws(30, 120)):
+    for frame in range(draws(20, 120)):
         step = 0.0 if frame == 0 else float(rng.uniform(0.01, 0.2))
         stamp_ns += round(step * NANOSECONDS)
         step = round(step * NANOSECONDS) / NANOSECONDS

@@ -58,7 +58,7 @@ def test_an_offset_of_up_to_a_minute_is_found_or_refused_but_never_wrong(offset:
 
 
 def test_the_deviation_is_that_of_the_errors_and_most_offsets_are_found() -> None:
-    count = draws(8, 12)
+    count = draws(5, 12)
     found = [clock_offset(*both(seed, 3.7, 60.0, 0.2)) for seed in range(count)]
     errors = np.array([(each.offset - 3.7) / each.stddev for each in found if each is not None])
     assert len(errors) >= 0.8 * count

@@ -250,10 +250,10 @@ def test_12000_recorded_and_forged_packets_a_second_use_up_nothing_of_the_sender
             taken.append(partner.give(partner.frame(at), at) is not None)
         return taken
 
-    assert all(flood(partner, now, 60))
+    assert all(flood(partner, now, 30))
     assert receiver.lost == 0
     again = Partner(receiver, session=11, address=partner.address)
-    assert all(flood(again, now + 60 * FRAME_NS, 40)[20:])  # once the one before counts as silent
+    assert all(flood(again, now + 30 * FRAME_NS, 40)[20:])  # once the one before counts as silent
 
 
 def test_each_unknown_session_is_asked_ten_times_a_second_and_few_are_remembered() -> None:

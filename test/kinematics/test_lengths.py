@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,7 @@ BASE = BASE_STDDEV[POINTS] ** 2
 ARM = [LENGTHS.index(name) for name in ("upper_arm_left", "forearm_left", "hand_left")]
 
 
+@cache
 def moving_person(seed: int, seconds: float, rate: float = 30.0) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Times (n,), points (n, 19, 3) and lengths (21,)."""
     rng = np.random.default_rng(seed)
