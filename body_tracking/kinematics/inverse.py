@@ -175,9 +175,7 @@ class InverseKinematics:
         target = np.where(measured[:, None], positions, 0.0)
         posture = self.model.forward(q, lengths)
         size = _sizes((target - posture.positions) * weights[:, None])
-        return self._costs(
-            size, self.ranges.soft_coordinates(q).values, self.prior.tilt_of(posture.rotations[..., 0, :, :])
-        )
+        return self._costs(size, self.ranges.values(q), self.prior.tilt_of(posture.rotations[..., 0, :, :]))
 
     def turned_about(
         self, q: FloatArray, positions: FloatArray, stddev: FloatArray, lengths: FloatArray

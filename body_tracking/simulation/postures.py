@@ -87,7 +87,7 @@ _SHOULDERS: Final = np.array([MODEL.coordinate_names.index(f"shoulder_x_{side}")
 SHOULDER_QUATERNIONS: Final = tuple(MODEL.quaternion_of(f"upper_arm_{side}") for side in ("left", "right"))
 PELVIS_QUATERNION: Final = MODEL.quaternion_of("pelvis")
 FROM_CENTRE: Final = so3.quat_inverse(
-    so3.exp(np.stack([_RANGES.soft_coordinates(MODEL.neutral()).values[start : start + 3] for start in _SHOULDERS]))
+    so3.exp(np.stack([_RANGES.values(MODEL.neutral())[start : start + 3] for start in _SHOULDERS]))
 )
 """(2, 4) orientations of the upper arms at the centres of their reach, in the clavicles' frames."""
 
@@ -164,7 +164,7 @@ def configuration(postures: FloatArray) -> FloatArray:
 
 def _within_reach(q: FloatArray) -> FloatArray:
     """Compress the shoulders' swing and twist into their limits, in place."""
-    values = _RANGES.soft_coordinates(q).values[:, _SHOULDERS[:, None] + np.arange(3)]
+    values = _RANGES.values(q)[:, _SHOULDERS[:, None] + np.arange(3)]
     size = np.linalg.norm(values[..., :2], axis=-1, keepdims=True) / np.radians(SHOULDER_SWING)
     values[..., :2] *= _bounded(size) / np.maximum(size, 1e-12)
     values[..., 2] = np.radians(SHOULDER_TWIST) * _bounded(values[..., 2] / np.radians(SHOULDER_TWIST))

@@ -85,7 +85,7 @@ _NECK = _indices("neck")
 _ARMS = tuple(_indices("clavicle", "shoulder", "elbow", "forearm", "wrist", end=side) for side in ("_left", "_right"))
 """Per side: clavicle (2), shoulder (3), elbow, forearm, wrist (2)."""
 _SHOULDERS = np.stack([_indices("shoulder", end=side) for side in ("_left", "_right")])
-_HANGING: Final = _RANGES.soft_coordinates(MODEL.neutral()).values[_SHOULDERS]
+_HANGING: Final = _RANGES.values(MODEL.neutral())[_SHOULDERS]
 """(2, 3) rotation vectors of hanging arms from the centres of their reach."""
 _MIRROR_ARM = np.array([1.0, 1.0, -1.0, 1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
 """Factors from a left arm's shares to a right arm's: only the shoulder's rotation vector changes signs."""

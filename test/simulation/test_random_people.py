@@ -48,7 +48,7 @@ def test_every_angle_stays_inside_its_range(seed: int) -> None:
 
 def test_together_people_use_most_of_every_range() -> None:
     ranges = Ranges(MODEL)
-    values = np.concatenate([ranges.soft_coordinates(someone(seed, 20.0).q).values for seed in range(20)])
+    values = np.concatenate([ranges.values(someone(seed, 20.0).q) for seed in range(20)])
     used = (values.max(axis=0) - values.min(axis=0)) / (ranges.high - ranges.low)
     assert used.min() > 0.6
 
