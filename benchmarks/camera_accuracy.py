@@ -23,11 +23,13 @@ import sys
 import zlib
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import common
 import numpy as np
-from accuracy import DEFAULT, OURS, compared, filtered_by
+from accuracy import DEFAULT, OURS, compared
 from camera_skeleton import INSIDE, MOTIONS, Placed
+from offline_graph import OfflineGraph
 
 from body_tracking.camera.lifting import Lifted, lift
 from body_tracking.camera.model_files import default_folder
@@ -36,13 +38,19 @@ from body_tracking.camera.pose_model import Landmark, Landmarks, PoseModel
 from body_tracking.core.camera import Camera
 from body_tracking.core.clocks import ClockModel
 from body_tracking.core.measurement import BONE_CORRELATION
-from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton
+from body_tracking.core.message_types import JOINT_STATE
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, IntArray, Joint, Skeleton, TrackingState
 from body_tracking.core.sources import RecordedFrame, optical_frame
-from body_tracking.evaluation.metrics import Curve
+from body_tracking.evaluation.metrics import Curve, wrapped
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.kinect.simulated_sensor import Misreading, SimulatedKinect
+from body_tracking.kinematics.positional import positional_angles
 from body_tracking.mesh.depth import to_metres
+from body_tracking.messages.base import to_nanoseconds
+from body_tracking.messages.cdr import decode_skeletons, encode_skeletons
+from body_tracking.pipeline import graph
 from body_tracking.recording.replay import ReplaySettings
+from body_tracking.recording.rosbag2 import deserialize
 from body_tracking.simulation.colour_images import Painter, colour_camera
 from body_tracking.simulation.depth_scene import RATE, DepthFrame, held_out
 from body_tracking.simulation.makehuman import find_wheel, load
@@ -68,6 +76,17 @@ COLUMNS = {
     "elbow": "elbow",
     "covered_elbow": "covered",
 }
+
+
+ARMS = ("shoulder_elevation_left", "shoulder_elevation_right", "elbow_flexion_left", "elbow_flexion_right")
+
+
+class Angles(NamedTuple):
+    """(n, 4) published angles of ``ARMS`` and their stated deviations, radians, and (n,) stamps."""
+
+    position: FloatArray
+    stddev: FloatArray
+    stamps_ns: IntArray
 
 
 class PublishedErrors:
@@ -194,20 +213,81 @@ def figures_of(job: tuple[str, int, float, int]) -> dict[str, dict[str, float]]:
     for name in (KINECTS, NETWORK, PUBLISHED):
         sensors = tuple(dict.fromkeys(frame.sensor for frame in frames[name]))
         others = () if name == KINECTS else sensors
+        of_bones = BONE_CORRELATION if name == KINECTS else 0.0  # as `up` sets the parameters
         outputs: dict[str, list[Skeleton]] = {}
+        published: dict[str, Angles] = {}
         for label, filter_name in FILTERS.items():
             settings = ReplaySettings(
-                tuple(sorted(sensors)), filter_name=filter_name, parameters={"skeleton_filter": {"not_kinects": others}}
+                tuple(sorted(sensors)),
+                filter_name=filter_name,
+                convention="isb" if label == OURS else graph.POSITIONAL,
+                parameters={
+                    "skeleton_filter": {"not_kinects": others, "ekf.bone_correlation": of_bones},
+                    "joint_angles": {"bone_correlation": of_bones},
+                },
             )
-            _, outputs[label] = filtered_by(settings, frames[name])
+            outputs[label], published[label] = run_graph(settings, frames[name])
         begin = max(each[0].stamp_ns for each in outputs.values())
         for label, skeletons in outputs.items():
             some = [each for each in skeletons if each.stamp_ns >= begin]
             poses = [view.pose for view in views]
-            # as `up` sets the parameter
-            of_bones = BONE_CORRELATION if name == KINECTS else 0.0
             figures = compared(some, poses, who.person.capsules(), curve, START_NS, of_bones)
-            found[f"{name}, {label}"] = {**own[name], **{key: getattr(figures, key) for key in COLUMNS}}
+            old = {"old_" + key: getattr(figures, key) for key in COLUMNS}
+            positions = {key: getattr(figures, key) for key in ("error", "fixed")}
+            found[f"{name}, {label}"] = {
+                **own[name],
+                **positions,
+                **figures_of_angles(published[label], begin, curve),
+                **old,
+            }
+    return found
+
+
+def run_graph(settings: ReplaySettings, frames: Sequence[RecordedFrame]) -> tuple[list[Skeleton], Angles]:
+    """Filtered skeletons, and published angles of the arms, of the graph from its sensors' frames."""
+    skeletons: list[Skeleton] = []
+    values: tuple[dict[int, FloatArray], dict[int, FloatArray]] = {}, {}
+    topics = graph.joint_states_topic(graph.DEFAULT_BODY), graph.joint_states_stddev_topic(graph.DEFAULT_BODY)
+
+    def take(topic: str, cdr: bytes, _at_ns: int) -> None:
+        if topic == graph.FILTERED:
+            skeletons.extend(decode_skeletons(cdr) or ())
+        elif topic in topics:
+            message = deserialize(JOINT_STATE, cdr)
+            names = [name.removesuffix(f"_{graph.DEFAULT_BODY}") for name in message.name]
+            values[topics.index(topic)][to_nanoseconds(message.header.stamp)] = np.array(
+                [message.position[names.index(name)] for name in ARMS]
+            )
+
+    whole = OfflineGraph(settings, take, map(graph.skeleton_topic, settings.sensors))
+    whole.start(frames[0].received_ns)
+    for frame in frames:
+        whole.push(graph.skeleton_topic(frame.sensor), encode_skeletons(frame.skeletons), frame.received_ns)
+    whole.finish(frames[-1].received_ns)
+    stamps = sorted(values[0].keys() & values[1].keys())
+    return skeletons, Angles(*(np.array([each[stamp] for stamp in stamps]) for each in values), np.array(stamps))
+
+
+def figures_of_angles(angles: Angles, begin_ns: int, curve: Curve) -> dict[str, float]:
+    """RMSE of the published angles, degrees, and the shares of errors within 1.96 stated deviations."""
+    times = (angles.stamps_ns - START_NS) / NANOSECONDS
+    here = (angles.stamps_ns >= begin_ns) & (times >= curve.span[0]) & (times <= curve.span[1])
+    tracked = np.full(len(Joint), TrackingState.TRACKED, dtype=np.uint8)
+    true = np.array(
+        [
+            [each.position[each.names.index(name)] for name in ARMS]
+            for each in (positional_angles(Skeleton(0, "world", at, tracked)) for at in curve.at(times[here]))
+        ]
+    )
+    off, stddev = wrapped(np.abs(angles.position[here]) - true), angles.stddev[here]
+    known = np.isfinite(off) & np.isfinite(stddev)
+    found = {}
+    for kind, columns in (("elevation", slice(0, 2)), ("elbow", slice(2, 4))):
+        each, sure, there = off[:, columns], stddev[:, columns], known[:, columns]
+        found[kind] = common.rms_deg(each)
+        found[f"covered_{kind}"] = float((np.abs(each) <= common.NORMAL * sure)[there].mean())
+        found[f"stated_{kind}"] = float(np.degrees(np.median(sure[there])))
+        found[f"known_{kind}"] = float(there.mean())
     return found
 
 

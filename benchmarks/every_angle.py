@@ -46,7 +46,7 @@ def errors_of(convention: str, run: Run) -> Errors:
             replay(Path(folder) / "in", out, ReplaySettings((), filter_name=name, convention=convention))
             tracked = read(out)
             errors, stddevs = against_truth(tracked.angles, tracked.true_angles, tracked.angles.names)
-            kinds = np.array([_kind(each) for each in tracked.angles.names])
+            kinds = np.array([kind_of(each) for each in tracked.angles.names])
             found[name] = {
                 kind: (errors[:, kinds == kind].ravel(), stddevs[:, kinds == kind].ravel())
                 for kind in dict.fromkeys(kinds)
@@ -54,7 +54,7 @@ def errors_of(convention: str, run: Run) -> Errors:
     return found
 
 
-def _kind(angle: str) -> str:
+def kind_of(angle: str) -> str:
     """The name without the side of an arm; ``thorax_axial_left`` is a direction."""
     limb, _, side = angle.rpartition("_")
     return limb if side in ("left", "right") and not angle.startswith(("thorax", "neck")) else angle

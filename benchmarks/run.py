@@ -60,6 +60,7 @@ class Benchmark(NamedTuple):
 
 BENCHMARKS = {
     "real_pairs": Benchmark(5, PAIRS, "--ekf"),
+    "real_angles": Benchmark(5, PAIRS),
     "kinect_vs_vicon": Benchmark(1, recordings("kinect_vs_vicon")),
     "baseline": Benchmark(4),
     "depth_images": Benchmark(1, MAKEHUMAN),

@@ -111,7 +111,10 @@ def orientation_topics(segments: Sequence[str]) -> dict[str, str]:
     return {graph.orientation_topic(segment): segment for segment in segments}
 
 
-_SETTABLE = {"": ("measurement_noise_scale", "predict_for", "t_pose"), "ekf.": ("predict_for", "posture", "t_pose")}
+_SETTABLE = {
+    "": ("measurement_noise_scale", "predict_for", "t_pose"),
+    "ekf.": ("predict_for", "posture", "t_pose", "bone_correlation"),
+}
 """The settable parameters of filters by prefix; those of the thesis are fixed."""
 
 

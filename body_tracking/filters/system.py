@@ -18,6 +18,7 @@ from body_tracking.pipeline.system import (
     System,
     TopicSpec,
     asked,
+    independent_joints,
     sensors_and_transport,
 )
 
@@ -41,6 +42,7 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
     defaults: dict[str, Value] = {"orientations": segments} if segments else {}
     if options["computed"]:
         defaults["not_kinects"] = options["computed"]
+    defaults |= {f"ekf.{name}": value for name, value in independent_joints(options).items()}
     if options["lag"] and options["filter"] in THESIS_FILTERS:
         raise graph.GraphError(f"filter {options['filter']} cannot smooth (lag)")
     chosen = asked(options, filter="filter", input="filter_input", subject="subject", people="people", lag="lag")

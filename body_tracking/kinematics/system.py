@@ -17,6 +17,7 @@ from body_tracking.pipeline.system import (
     System,
     TopicSpec,
     asked,
+    independent_joints,
     transport,
 )
 
@@ -37,11 +38,12 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
     angles: dict[str, Value] = asked(options, input="angles_input", subject="subject", people="people")
     if options["convention"] not in ("", graph.AUTO) or graph.convention_of(role.angles_input) != role.convention:
         angles["convention"] = role.convention
-    # The errors of neighbouring joints of a Kinect, or of the fit of a mesh, are correlated (0.6 to 0.9 in simulated
-    # people); those of a camera's landmarks are independent.
-    cameras_alone = bool(options["computed"]) and options["sensors"] == options["computed"] and not options["depth"]
-    defaults: dict[str, Value] = {"bone_correlation": 0.0} if cameras_alone else {}
-    yield NodeSpec("joint_angles", "joint_angles", defaults=defaults, parameters={**transport(options), **angles})
+    yield NodeSpec(
+        "joint_angles",
+        "joint_angles",
+        defaults=independent_joints(options),
+        parameters={**transport(options), **angles},
+    )
 
 
 SYSTEM = System(

@@ -245,6 +245,16 @@ def transport(options: Options) -> dict[str, Value]:
     return {"reliable": True} if options["reliable"] else {}
 
 
+def independent_joints(options: Options) -> dict[str, Value]:
+    """Parameter ``bone_correlation`` where all sensors are cameras whose skeletons come from landmarks.
+
+    The errors of neighbouring joints of a Kinect, or of the fit of a mesh, are correlated (0.6 to 0.9 in simulated
+    people); those of a camera's landmarks are independent.
+    """
+    cameras = bool(options["computed"]) and options["sensors"] == options["computed"] and not options["depth"]
+    return {"bone_correlation": 0.0} if cameras else {}
+
+
 def asked(options: Options, **parameters: str) -> dict[str, Value]:
     """Parameters with the values of options, ``parameter=option``; options without a value are left out."""
     return {name: options[option] for name, option in parameters.items() if options[option]}

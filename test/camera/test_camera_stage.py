@@ -264,7 +264,10 @@ def test_states_follow_visibility() -> None:
 def test_errors_of_neighbouring_joints_are_independent_where_cameras_are_alone() -> None:
     def given(**options: tuple[str, ...]) -> object:
         specs = {spec.name: spec for spec in nodes_for(options_of(**options))}
-        return specs["joint_angles"].defaults.get("bone_correlation", "as of Kinects")
+        angles = specs["joint_angles"].defaults.get("bone_correlation", "as of Kinects")
+        # `ekf` states the deviations of its own angles
+        assert specs["skeleton_filter"].defaults.get("ekf.bone_correlation", "as of Kinects") == angles
+        return angles
 
     assert given(camera=("camera1", "camera2")) == 0.0
     assert given(sensors=("kinect1",), camera=("camera1",)) == given(depth=("kinect1",)) == "as of Kinects"

@@ -28,7 +28,7 @@ class Displacement:
         self._space, self._centres, self._parameters = space, centres, parameters
         self._rows = (_DIMENSIONS * space.model.joints[:, None] + np.arange(_DIMENSIONS)).reshape(-1)
         joints = space.model.joints
-        correlation = joint_correlation()[np.ix_(joints, joints)]
+        correlation = joint_correlation(parameters.bone_correlation)[np.ix_(joints, joints)]
         self._correlation = np.kron(correlation, np.eye(_DIMENSIONS))
         tangent = len(space.rest_information)
         self._prior_information = np.zeros((space.observed, space.observed))

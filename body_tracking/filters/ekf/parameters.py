@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from body_tracking.core import chi_square
+from body_tracking.core.measurement import BONE_CORRELATION
 from body_tracking.core.parameters import check_fields, number_field
 from body_tracking.filters.ekf.sources import OrientationParameters
 from body_tracking.filters.parameters import T_POSE, FilterError
@@ -35,6 +36,14 @@ class EkfParameters(OrientationParameters):
         "1",
         0.0,
         10.0,
+    )
+    bone_correlation: float = number_field(
+        BONE_CORRELATION,
+        "correlation of these distances at the two joints of a bone, for the deviations of angles: the default is a "
+        "Kinect's; 0 for joints with independent errors, as those of cameras",
+        "1",
+        0.0,
+        0.99,
     )
     slow_time: float = number_field(3.0, "time for which a sensor's slow errors persist", "s", 0.05, 1000.0)
     gate_probability: float = number_field(
