@@ -34,7 +34,6 @@ from common import Mean
 from offline_graph import OfflineGraph
 from thesis_pipeline import EKF, LKF1, LKF2, run_thesis
 
-from body_tracking.core.measurement import BONE_CORRELATION
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, Skeleton, TrackingState
 from body_tracking.core.sources import RecordedFrame
@@ -181,7 +180,6 @@ def compared(
     capsules: Capsules,
     curve: Curve,
     zero_ns: int,
-    of_bones: float = BONE_CORRELATION,
 ) -> Figures:
     """Compare skeletons with the true joints.
 
@@ -191,7 +189,6 @@ def compared(
         capsules: the person's limbs, which hide joints.
         curve: true joints by time, seconds.
         zero_ns: stamp of the curve's time 0.
-        of_bones: parameter ``bone_correlation`` of ``joint_angles``.
     """
     times = np.array([(each.stamp_ns - zero_ns) / NANOSECONDS for each in skeletons])
     first, last = curve.span
@@ -204,7 +201,7 @@ def compared(
     own = np.einsum("njba,njb->nja", segment_frames(true), found - true) - errors.offset
     apart = np.linalg.norm(own, axis=-1)[:, TEN]
     hidden = _hidden(poses, capsules, true)[:, TEN] & np.isfinite(apart)
-    angles, stddev = _angles(skeletons, of_bones)
+    angles, stddev = _angles(skeletons)
     right, _ = _angles([_true_skeleton(each) for each in true])
     off = wrapped(angles - right)
     covered = np.where(np.isfinite(stddev), np.abs(off) <= common.NORMAL * stddev, np.nan)
@@ -241,9 +238,9 @@ def _true_skeleton(positions: FloatArray) -> Skeleton:
     return Skeleton(0, "world", positions, np.full(len(positions), TrackingState.TRACKED, dtype=np.uint8))
 
 
-def _angles(skeletons: Iterable[Skeleton], of_bones: float = BONE_CORRELATION) -> tuple[FloatArray, FloatArray]:
+def _angles(skeletons: Iterable[Skeleton]) -> tuple[FloatArray, FloatArray]:
     """(n, m) positional angles and their standard deviations, radians; NaN and infinity where unknown."""
-    found = [positional_angles(each, of_bones) for each in skeletons]
+    found = [positional_angles(each) for each in skeletons]
     return np.stack([each.position for each in found]), np.stack([each.position_stddev for each in found])
 
 
