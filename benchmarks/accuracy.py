@@ -44,7 +44,7 @@ from body_tracking.kinect.occlusion import Capsules, obstruction
 from body_tracking.kinect.simulated import KinectErrors, parameters
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
 from body_tracking.kinematics.schlagenhauf26 import Schlagenhauf26
-from body_tracking.messages.cdr import decode_skeletons, encode_skeletons
+from body_tracking.messages.cdr import decode_skeletons
 from body_tracking.pipeline import graph
 from body_tracking.recording.replay import ReplaySettings
 from body_tracking.simulation.layouts import NUMBERS, layout
@@ -117,11 +117,7 @@ def filtered_by(settings: ReplaySettings, frames: Sequence[RecordedFrame]) -> tu
         if topic in found:
             found[topic] += decode_skeletons(cdr) or ()
 
-    whole = OfflineGraph(settings, take, map(graph.skeleton_topic, settings.sensors))
-    whole.start(frames[0].received_ns)
-    for frame in frames:
-        whole.push(graph.skeleton_topic(frame.sensor), encode_skeletons(frame.skeletons), frame.received_ns)
-    whole.finish(frames[-1].received_ns)
+    OfflineGraph(settings, take, map(graph.skeleton_topic, settings.sensors)).play(frames)
     return found[graph.FUSED], found[graph.FILTERED]
 
 

@@ -48,7 +48,7 @@ from body_tracking.kinect.simulated_sensor import Misreading, SimulatedKinect
 from body_tracking.kinematics.positional import positional_angles
 from body_tracking.mesh.depth import to_metres
 from body_tracking.messages.base import to_nanoseconds
-from body_tracking.messages.cdr import decode_skeletons, encode_skeletons
+from body_tracking.messages.cdr import decode_skeletons
 from body_tracking.pipeline import graph
 from body_tracking.recording.replay import ReplaySettings
 from body_tracking.recording.rosbag2 import deserialize
@@ -257,11 +257,7 @@ def run_graph(settings: ReplaySettings, frames: Sequence[RecordedFrame]) -> tupl
                 [message.position[names.index(name)] for name in ARMS]
             )
 
-    whole = OfflineGraph(settings, take, map(graph.skeleton_topic, settings.sensors))
-    whole.start(frames[0].received_ns)
-    for frame in frames:
-        whole.push(graph.skeleton_topic(frame.sensor), encode_skeletons(frame.skeletons), frame.received_ns)
-    whole.finish(frames[-1].received_ns)
+    OfflineGraph(settings, take, map(graph.skeleton_topic, settings.sensors)).play(frames)
     stamps = sorted(values[0].keys() & values[1].keys())
     return skeletons, Angles(*(np.array([each[stamp] for stamp in stamps]) for each in values), np.array(stamps))
 

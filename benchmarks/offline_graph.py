@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
+from body_tracking.core.sources import RecordedFrame
+from body_tracking.messages.cdr import encode_skeletons
+from body_tracking.pipeline import graph
 from body_tracking.pipeline.offline import OfflineRunner
 from body_tracking.recording.forked import is_second
 from body_tracking.recording.replay import ReplaySettings
@@ -52,3 +55,10 @@ class OfflineGraph:
         """Finish all stages, after the last message."""
         self._upstream.finish(at_ns)
         self._downstream.finish(at_ns)
+
+    def play(self, frames: Sequence[RecordedFrame]) -> None:
+        """Pass on all frames of the sensors, in the order of receipt, from start to finish."""
+        self.start(frames[0].received_ns)
+        for frame in frames:
+            self.push(graph.skeleton_topic(frame.sensor), encode_skeletons(frame.skeletons), frame.received_ns)
+        self.finish(frames[-1].received_ns)

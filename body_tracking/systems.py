@@ -14,11 +14,11 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from body_tracking.core.parameters import Parameter, Value, as_yaml, check_all, is_ros_own, is_wildcard, read_file
-from body_tracking.core.plugins import entry_points_of
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.system import NodeSpec, Options, Place, System, asked, load
 
@@ -35,7 +35,7 @@ def _found() -> tuple[System, ...]:
     )
     ours = [load(f"body_tracking.{folder}.system:SYSTEM") for folder in folders]
     others = []
-    for entry in entry_points_of(ENTRY_POINTS):
+    for entry in entry_points(group=ENTRY_POINTS):
         try:
             others.append(entry.load())
         except Exception as error:  # of another package, which must not stop ours

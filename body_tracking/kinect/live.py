@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from importlib.metadata import entry_points
 from typing import Protocol
 
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.parameters import described_field, number_field
-from body_tracking.core.plugins import entry_points_of
 from body_tracking.core.sources import RecordedFrame
 from body_tracking.kinect.kinect_protocol import DEFAULT_PORT
 from body_tracking.pipeline.system import load
@@ -99,7 +99,7 @@ _BACKENDS = {
 
 def backends() -> tuple[str, ...]:
     """The names of all backends, including those of other installed packages."""
-    return tuple(sorted({*_BACKENDS, *(entry.name for entry in entry_points_of(ENTRY_POINTS))}))
+    return tuple(sorted({*_BACKENDS, *entry_points(group=ENTRY_POINTS).names}))
 
 
 def open_source(backend: str, settings: SourceSettings) -> SkeletonSource:
@@ -116,7 +116,7 @@ def open_source(backend: str, settings: SourceSettings) -> SkeletonSource:
         opener = load(_BACKENDS[backend])
         return opener(settings)
     try:
-        opener = next(entry for entry in entry_points_of(ENTRY_POINTS) if entry.name == backend).load()
+        opener = entry_points(group=ENTRY_POINTS)[backend].load()
         return opener(settings)
     except BodyTrackingError:
         raise

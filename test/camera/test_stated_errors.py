@@ -135,6 +135,6 @@ def test_bands_of_the_extended_filter_hold_for_independent_errors_of_joints() ->
             right = np.array([positional_angles(truth.skeleton(instant)).position[angles] for instant in instants])
             found[:, 2:] = np.abs(found[:, 2:])  # elevations by ISB are negative
             each.append((np.abs(found - right) < 1.96 * stddev).mean(axis=0))
-    right, narrow = (np.mean(each, axis=0) for each in shares.values())
-    assert (right > 0.88).all(), dict(zip(NAMES, right, strict=True))
-    assert (narrow < right).all(), dict(zip(NAMES, narrow, strict=True))
+    independent, correlated = (np.mean(each, axis=0) for each in shares.values())
+    assert (independent > 0.88).all(), dict(zip(NAMES, independent, strict=True))
+    assert (correlated < independent).all(), dict(zip(NAMES, correlated, strict=True))
