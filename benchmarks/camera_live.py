@@ -27,6 +27,7 @@ from body_tracking.camera.codecs import CompressedColour
 from body_tracking.camera.model_files import default_folder
 from body_tracking.camera.people import PersonTracker
 from body_tracking.camera.pose_model import PoseModel
+from body_tracking.camera.settings import THREADS
 from body_tracking.camera.topics import COMPRESSED, DRIVERS
 from body_tracking.core.qos import LATCHED
 from body_tracking.core.sensor_poses import SensorPose
@@ -58,7 +59,7 @@ def recorded() -> tuple[list[tuple[str, bytearray]], list[dict[str, bytearray]]]
 
 def inference_ms(pairs: list[dict[str, bytearray]]) -> tuple[float, float]:
     """Median wall and processor time of the networks for an image in which the person is tracked, milliseconds."""
-    tracker, times = PersonTracker(PoseModel(default_folder()), 1, 0.3), []
+    tracker, times = PersonTracker(PoseModel(default_folder(), int(str(THREADS.default))), 1, 0.3), []
     for number, pair in enumerate(pairs[:60]):
         _, _, image = CompressedColour().decode(bytes(pair["colour"]), BAG_WIRE)
         begin = time.perf_counter(), time.process_time()

@@ -194,6 +194,7 @@ class Ear:
         self.received: dict[str, dict[int, int]] = {}
         self.statuses: dict[str, tuple[float, NodeStatus]] = {}
         self._now = now
+        self._thread: threading.Thread | None = None
 
     def time(self, name: str, topic: str, kind: type = JointState, qos: Any = RELIABLE) -> None:
         """Note the first receipt of each stamp on a topic."""
@@ -231,11 +232,14 @@ class Ear:
             with contextlib.suppress(ExternalShutdownException):
                 self.executor.spin()
 
-        threading.Thread(target=run, daemon=True).start()
+        self._thread = threading.Thread(target=run, daemon=True)
+        self._thread.start()
 
     def close(self) -> None:
-        """Shut rclpy down."""
+        """Shut rclpy down, and wait for the thread: one that Python ends within rclpy aborts the process."""
         rclpy.try_shutdown()
+        if self._thread is not None:
+            self._thread.join(10.0)
 
 
 class Bench(Ear):

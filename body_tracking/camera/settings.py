@@ -24,7 +24,8 @@ MODEL = Parameter(
 )
 PEOPLE = Parameter("people", 1, "the largest number of people per camera", min=1, max=6)
 SEARCH = Parameter("search_every", 0.3, "time between two searches for more people", "s", 0.0, 10.0)
-THREADS = Parameter("threads", 1, "processors that a network may use", min=1, max=16)
+THREADS = Parameter("threads", 2, "processors that a network may use", min=1, max=16)
+"""Of two, since on slow cores one takes longer for an image than the time between two at 30 Hz (docs/measured.md)."""
 
 WAIT_NS: Final = NANOSECONDS // 10
 """Longest wait of an image for the others of its time."""
