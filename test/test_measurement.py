@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose
 
 from body_tracking.core.measurement import (
     BASE_STDDEV,
+    HEAD_CORRELATION,
     INFERRED_FACTOR,
     body_heading,
     joint_correlation,
@@ -80,10 +81,11 @@ def test_frames_are_weighed_one_by_one_or_together() -> None:
 @pytest.mark.parametrize("of_bones", [0.0, 0.5, 0.86])
 def test_errors_of_joints_are_correlated_less_with_each_bone_between_them(of_bones: float) -> None:
     correlation = joint_correlation(of_bones)
-    bones = np.full((N_JOINTS, N_JOINTS), np.inf)
-    np.fill_diagonal(bones, 0.0)
+    expected = np.eye(N_JOINTS)
     for parent, child in BONES:  # from the base outwards: a child is one bone farther from all others than its parent
-        bones[child] = np.minimum(bones[child], bones[parent] + 1.0)
-        bones[:, child] = bones[child]
-    assert_allclose(correlation, of_bones**bones, atol=1e-9)
+        shared = min(of_bones, HEAD_CORRELATION) if child == Joint.HEAD else of_bones
+        known = expected[parent] * shared
+        known[child] = 1.0
+        expected[child] = expected[:, child] = known
+    assert_allclose(correlation, expected, atol=1e-9)
     assert np.linalg.eigvalsh(correlation)[0] > 0.0

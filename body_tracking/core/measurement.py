@@ -43,6 +43,10 @@ bones have better directions than independent joints would give. With this value
 elbow match the errors of a Kinect v2 against Vicon that remain after the correction of the arms' directions, in people
 to whom the correction was not fitted (``benchmarks/kinect_vs_vicon.py --fit``)."""
 
+HEAD_CORRELATION = 0.65
+"""The same of head and neck: Kinects v2 show the heads of three people who exercise at constant places between 40 mm to
+the right and 65 mm to the left of the neck, and two sensors differ by 20 to 100 mm at one time (``kinect_pairs``)."""
+
 GIRDLE_CORRELATION = BONE_CORRELATION**2
 """Correlation of the errors of the left and the right shoulder, and of both hips: two bones lie between them. With this
 value the twist between shoulders and hips has a deviation of 11 degrees if all four joints have that of ``BASE_STDDEV``
@@ -62,13 +66,16 @@ _REFERENCE_DISTANCE = 2.0
 def joint_correlation(of_bones: float = BONE_CORRELATION) -> FloatArray:
     """(25, 25) correlation of the joints' errors, ``of_bones`` to the power of the number of bones between two joints.
 
-    This is the Gauss-Markov field on the tree of bones: given a joint, the two sides of it are independent. Outside the
-    diagonal, the inverse has entries only for the two joints of a bone.
+    Head and neck have at most :data:`HEAD_CORRELATION`. This is the Gauss-Markov field on the tree of bones: given a
+    joint, the two sides of it are independent. Outside the diagonal, the inverse has entries only for the two joints
+    of a bone.
 
     Args:
         of_bones: correlation of the two joints of a bone, from 0 (independent) to less than 1.
     """
-    return _tree_correlation([(start, end, of_bones) for start, end in BONES])
+    return _tree_correlation(
+        [(start, end, min(of_bones, HEAD_CORRELATION) if end == Joint.HEAD else of_bones) for start, end in BONES]
+    )
 
 
 def offset_correlation(of_bones: float = BONE_CORRELATION) -> FloatArray:
