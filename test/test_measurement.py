@@ -10,6 +10,7 @@ from body_tracking.core.measurement import (
     BASE_STDDEV,
     HEAD_CORRELATION,
     INFERRED_FACTOR,
+    back_view_factor,
     body_heading,
     joint_correlation,
     joint_stddev,
@@ -69,6 +70,19 @@ def test_stated_covariances_are_used() -> None:
     # but not below the errors for which the correlation is known
     smaller = joint_variance(AT_TWO_METRES, states, 0.01 * covariances)
     assert_allclose(np.delete(smaller, unknown), np.delete(BASE_STDDEV**2, unknown))
+
+
+@pytest.mark.parametrize("degrees", [0.0, 30.0, 60.0])
+def test_a_back_that_is_taken_for_the_front_is_as_uncertain_as_a_back(degrees: float) -> None:
+    front, back = turned(degrees), turned(180.0 - degrees)
+    factor = back_view_factor(float(viewing_angle(front)))
+    # the body's middle is 0.2 % farther away where it shows the back
+    assert_allclose(factor * joint_stddev(front, TRACKED) ** 2, joint_stddev(back, TRACKED) ** 2, rtol=0.01)
+
+
+@pytest.mark.parametrize("angle", [np.radians(90.0), np.radians(150.0), np.nan])
+def test_a_frame_with_swapped_sides_is_less_certain_at_any_angle(angle: float) -> None:
+    assert back_view_factor(angle) == 2.0
 
 
 def test_frames_are_weighed_one_by_one_or_together() -> None:

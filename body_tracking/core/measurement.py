@@ -58,7 +58,8 @@ _RIGHT_ENDS = np.array([Joint.SHOULDER_RIGHT, Joint.HIP_RIGHT], dtype=np.intp)
 
 _YAW_DEG = np.array([0.0, 30.0, 60.0, 90.0, 180.0])
 _YAW_FACTOR = np.array([1.0, 1.0, 1.3, 3.2, 3.2])
-"""Joint error against the body's yaw to the sensor: table 4.4 of Schlagenhauf 2017 (x1.3 at 60, x3.2 at 90 deg)."""
+"""Joint error against the body's yaw to the sensor: table 4.4 of Schlagenhauf 2017 (x1.3 at 60, x3.2 at 90 deg), and a
+back view as bad as a side view."""
 
 _REFERENCE_DISTANCE = 2.0
 
@@ -176,6 +177,18 @@ def joint_stddev(positions: FloatArray, states: np.ndarray, angle: FloatArray | 
     usable: BoolArray = (states > TrackingState.NOT_TRACKED) & np.isfinite(positions).all(axis=-1)
     result: FloatArray = np.where(usable, stddev, np.inf)
     return result
+
+
+def back_view_factor(angle: float) -> float:
+    """Factor on the variances of a frame that shows the back, of a sensor that takes every body to face it.
+
+    The frame's own variances are those of a front view. At least 2: left and right may be swapped wrongly.
+
+    Args:
+        angle: :func:`viewing_angle` of the frame as the sensor reports it, radians.
+    """
+    front, back = np.interp(np.degrees([angle, np.pi - angle]), _YAW_DEG, _YAW_FACTOR)
+    return max(2.0, float((back / front) ** 2))
 
 
 def joint_variance(

@@ -79,20 +79,25 @@ def reversed_halves(headings: Sequence[float], believed: Sequence[float]) -> lis
 
 
 def swap_left_right(
-    halves: Sequence[tuple[IntArray, bool]], points: FloatArray, variance: FloatArray, states: np.ndarray
+    halves: Sequence[tuple[IntArray, bool]],
+    points: FloatArray,
+    variance: FloatArray,
+    states: np.ndarray,
+    factor: float = 2.0,
 ) -> None:
     """Swap left and right, in place, in halves that are opposite, and reject the joints of those that are across.
 
     Args:
         halves: from :func:`reversed_halves`.
         points: (25, 3) metres.
-        variance: (25,) square metres; doubled by a swap, infinite for rejected joints.
+        variance: (25,) square metres; infinite for rejected joints.
         states: (25,).
+        factor: on the variances of the joints that are swapped.
     """
     for joints, opposite in halves:
         if opposite:
             other = MIRROR[joints]
             points[joints], states[joints] = points[other], states[other]
-            variance[joints] = 2.0 * variance[other]
+            variance[joints] = factor * variance[other]
         else:
             variance[joints] = np.inf

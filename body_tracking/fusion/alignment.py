@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from body_tracking.core.clocks import jumped_back
-from body_tracking.core.measurement import joint_variance, viewing_angle
+from body_tracking.core.measurement import back_view_factor, joint_variance, viewing_angle
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.sides import heading_weights, headings_of, reversed_halves, swap_left_right
 from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton
@@ -153,7 +153,7 @@ class SensorAlignment(PlacedSensors[_Sensor]):
         points, variance, states = seen.positions, seen.variance, seen.states
         if halves := reversed_halves(seen.headings, accepted):
             points, variance, states = points.copy(), variance.copy(), states.copy()
-            swap_left_right(halves, points, variance, states)
+            swap_left_right(halves, points, variance, states, back_view_factor(seen.angle))
         known = np.isfinite(variance)
         self.counters["repaired"] += any(opposite for _, opposite in halves)
         if not all(opposite for _, opposite in halves):

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from body_tracking.core.measurement import back_view_factor
 from body_tracking.core.sides import (
     HALVES,
     PAIRS,
@@ -182,7 +183,9 @@ class Sides:
         accepted = self.accepted_headings(stamp, names, angles, headings, weights, counters)
         for index, found in enumerate(headings):
             halves = reversed_halves(found, accepted)
-            swap_left_right(halves, points[index], variance[index], states[index])
+            if halves:
+                factor = back_view_factor(angles[index])
+                swap_left_right(halves, points[index], variance[index], states[index], factor)
             for _, opposite in halves:
                 counters["repaired" if opposite else "turned"] += 1
         lines = [[abs(math.cos(a - b)) for a, b in zip(found, accepted, strict=True)] for found in headings]
