@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from pathlib import Path
 
 import pytest
@@ -64,9 +65,47 @@ def test_messages_that_a_node_did_not_process_are_reported_where_they_are_many()
     assert losses_part({"fusion": found["fusion"]}) == []
 
 
-def test_the_recorder_rightly_waits_for_a_bag_that_has_not_begun() -> None:
-    monitor = object.__new__(GraphMonitor)  # without a node
+def monitor_without_node() -> GraphMonitor:
+    monitor = object.__new__(GraphMonitor)
     monitor._angles_topics, monitor._namespace, monitor.angles, monitor.clock_ns = (), "/", 0, 0
+    monitor._statuses, monitor._past, monitor._awaited = {}, deque(), []
+    return monitor
+
+
+def test_only_recent_losses_are_in_the_status_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monitor, now = monitor_without_node(), [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    found = []
+    for second in range(12):
+        now[0] = 100.0 + second
+        lost = 0 if second < 2 else 50  # 50 messages in the third second
+        values = {"received": str(100 * second), "lost /kinect1/skeleton": str(lost)}
+        monitor._statuses = {"fusion": NodeStatus("", 0, "", values, received=now[0])}
+        found.append("fusion 50" in monitor.line(options_of(sensors=()), 1.0, {}))
+    assert found[:2] == [False, False]
+    assert found[2:6] == [True] * 4
+    assert not any(found[8:])
+
+
+def test_a_bag_that_waits_names_the_nodes_that_it_waits_for() -> None:
+    monitor = monitor_without_node()
+    assert not monitor.has_subscribers({}, ["fusion", "joint_angles"])
+    line = monitor.line(options_of(sensors=("kinect1",), bag="arm"), 1.0, {})
+    assert line.strip() == "1.0 s (the bag plays once all nodes have started: fusion, joint_angles)"
+
+
+def test_a_sensor_that_never_sends_is_named() -> None:
+    monitor = monitor_without_node()
+    options = options_of(sensors=("kinect1", "misspelt"), external=True)
+    values = {"rate in /kinect1/skeleton": "30"}
+    monitor._statuses = {"fusion": NodeStatus("", 0, "", values, received=time.monotonic())}
+    hint = "nothing comes from /misspelt/skeleton; `body_tracking doctor --sensors misspelt` says more"
+    assert hint not in monitor.line(options, 2.0, {})
+    assert hint in monitor.line(options, 20.0, {})
+
+
+def test_the_recorder_rightly_waits_for_a_bag_that_has_not_begun() -> None:
+    monitor = monitor_without_node()
     alone, with_bag = options_of(sensors=()), options_of(sensors=(), bag="arm")
 
     def line(options: Options, level: int, text: str) -> str:

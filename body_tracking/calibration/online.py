@@ -776,4 +776,6 @@ class OnlineCalibration:
             return 1, f"waiting for a still pose seen by {self.reference} and {', '.join(waiting)}", values
         if uncertain:
             return 1, f"{', '.join(uncertain)}: roughly calibrated, walk about to refine", values
+        if self._now is None and not self._sensors:
+            return 1, f"no skeleton of {self.reference} yet", values
         return 0, "calibrated", values

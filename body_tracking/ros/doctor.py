@@ -200,5 +200,6 @@ def run(args: argparse.Namespace) -> int:
         print(f"{finding.level:8} {finding.found}", flush=True)
         if finding.remedy:
             print(f"      -> {finding.remedy}")
-    print(f"\nproblems: {counts[PROBLEM]}, warnings: {counts[WARNING]}, OK: {counts[OK]}")
+    verdict = "solve the problems first" if counts[PROBLEM] else "nothing here prevents tracking"
+    print(f"\nproblems: {counts[PROBLEM]}, warnings: {counts[WARNING]}, OK: {counts[OK]}: {verdict}")
     return 1 if counts[PROBLEM] else 0

@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
+from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import rclpy
@@ -43,6 +45,10 @@ _REPORTED_S = 1.5
 """Seconds of a bag after which each node has reported what it gets of it."""
 _FRESH = 3.0
 """Seconds for which a node's diagnostics are valid."""
+_RECENT_S = 5.0
+"""Seconds: the status line names the messages that were not processed in these last ones."""
+_SILENT_S = 10.0
+"""Seconds without a bag after which a sensor that has never sent is named."""
 
 
 def calibration_part(status: NodeStatus | None, sensors: Collection[str]) -> list[str]:
@@ -65,16 +71,33 @@ def problem_parts(statuses: Mapping[str, NodeStatus], *, bag_starts: bool = Fals
     return [f"{name}: {text}" for name, text in sorted(bad.items())]
 
 
-def losses_part(statuses: Mapping[str, NodeStatus]) -> list[str]:
-    """The messages that nodes did not process, where they are more than one in a hundred received ones."""
+def losses_part(
+    statuses: Mapping[str, NodeStatus], before: Mapping[str, NodeStatus] = MappingProxyType({})
+) -> list[str]:
+    """The messages that nodes did not process, where they are more than one in a hundred received ones.
+
+    Args:
+        statuses: by node.
+        before: earlier ones; only what came since counts.
+    """
     found = []
     for name, status in sorted(statuses.items()):
         if name in _SHOWING:
             continue
-        counts = [status.number(key) or 0.0 for key in status.values if key.startswith(_LOSSES)]
-        if sum(counts) > _NOTABLE_LOSS * (status.number("received") or 0.0):
-            found.append(f"{name} {sum(counts):.0f}")
+        lost, received = _losses(status)
+        if name in before:
+            earlier = _losses(before[name])
+            if earlier[0] <= lost and earlier[1] <= received:  # the node was not started anew
+                lost, received = lost - earlier[0], received - earlier[1]
+        if lost > _NOTABLE_LOSS * received:
+            found.append(f"{name} {lost:.0f}")
     return [f"messages not processed (machine or network too slow): {', '.join(found)}"] if found else []
+
+
+def _losses(status: NodeStatus) -> tuple[float, float]:
+    """Numbers of messages that a node did not process, and that it received."""
+    lost = sum(status.number(key) or 0.0 for key in status.values if key.startswith(_LOSSES))
+    return lost, status.number("received") or 0.0
 
 
 class GraphMonitor:
@@ -96,6 +119,10 @@ class GraphMonitor:
         """Whether somebody has called the service that ends the graph."""
         self._angles_topics = tuple(angles_topics)
         self._statuses: dict[str, NodeStatus] = {}
+        self._past: deque[tuple[float, Mapping[str, NodeStatus]]] = deque()
+        """Those of the last seconds, with their times."""
+        self._awaited: list[str] = []
+        """Nodes that have not reported, of those that a bag waits for."""
         self._context = rclpy.Context()
         rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         self._namespace = namespace
@@ -164,6 +191,7 @@ class GraphMonitor:
             nodes: that must all have reported.
         """
         statuses = [self._statuses.get(name) for name in nodes]
+        self._awaited = [name for name in nodes if name not in self._statuses]
         for topic, number in wanted.items():
             key = f"subscribers {names.resolved(topic, self._namespace)}"
             found = [status.number(key) or 0.0 for status in statuses if status is not None and key in status.values]
@@ -177,26 +205,30 @@ class GraphMonitor:
         """The status line: rates, delay, calibration, restarts."""
         now = time.monotonic()
         fresh = {name: status for name, status in self._statuses.items() if now - status.received < _FRESH}
-        parts = [f"{elapsed:6.1f} s"]
         player = fresh.get("bag_player")
         position = 0.0 if player is None else player.number("position s") or 0.0
         # nodes report once a second: until then they know nothing of a bag that plays already
         starts = bool(options["bag"]) and (not self.clock_ns or (player is not None and position < _REPORTED_S))
+        parts = [f"{elapsed:6.1f} s"]
         if starts and not position and not self.angles:
-            parts[0] += " (the bag plays once all nodes have started)"
-        elif player is not None:
-            parts[0] += f" (bag {position:.1f}/{player.number('duration s') or 0.0:.1f} s)"
-        parts.append(self._rates(options, fresh))
-        delay = self._delay(options, fresh)
-        if delay:
-            parts.append(delay)
-        parts += calibration_part(fresh.get("calibration"), sensors_of(options))
+            wait = f": {', '.join(self._awaited)}" if self._awaited else ""
+            parts[0] += f" (the bag plays once all nodes have started{wait})"
+        else:
+            if player is not None:
+                parts[0] += f" (bag {position:.1f}/{player.number('duration s') or 0.0:.1f} s)"
+            parts.append(self._rates(options, fresh))
+            delay = self._delay(options, fresh)
+            if delay:
+                parts.append(delay)
+            parts += calibration_part(fresh.get("calibration"), sensors_of(options))
+            if not options["bag"] and elapsed > _SILENT_S:
+                parts += self._silent_sensors(options, fresh)
         if not self.angles:
             parts += problem_parts(fresh, bag_starts=starts)
         malformed = sum(int(status.values.get("malformed", 0)) for status in fresh.values())
         if malformed:
             parts.append(f"malformed {malformed}")
-        parts += losses_part(fresh)
+        parts += losses_part(fresh, self._earlier(now))
         values = {f"{key}: {value}" for status in fresh.values() for key, value in status.values.items()}
         parts += sorted(each for each in values if each.startswith("publishers "))
         if options["robot"]:
@@ -204,6 +236,27 @@ class GraphMonitor:
         if restarts:
             parts.append("restarts " + ", ".join(f"{name} {count}" for name, count in restarts.items()))
         return " | ".join(parts)
+
+    def _earlier(self, now: float) -> Mapping[str, NodeStatus]:
+        """What the nodes reported :data:`_RECENT_S` before, or first."""
+        if not self._past or now - self._past[-1][0] > 1.0:
+            self._past.append((now, self._statuses))
+        while len(self._past) > 1 and now - self._past[1][0] >= _RECENT_S:
+            self._past.popleft()
+        return self._past[0][1]
+
+    def _silent_sensors(self, options: Options, fresh: Mapping[str, NodeStatus]) -> list[str]:
+        """The sensors of which fusion has not received a message."""
+        if "fusion" not in fresh:
+            return []
+        topics = {name: names.resolved(graph.skeleton_topic(name), self._namespace) for name in sensors_of(options)}
+        silent = {name: topic for name, topic in topics.items() if f"rate in {topic}" not in fresh["fusion"].values}
+        if not silent:
+            return []
+        return [
+            f"nothing comes from {', '.join(silent.values())}; `body_tracking doctor --sensors {','.join(silent)}` "
+            "says more"
+        ]
 
     def _rates(self, options: Options, fresh: Mapping[str, NodeStatus]) -> str:
         def rate(node: str, way: str, topic: str) -> str:

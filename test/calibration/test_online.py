@@ -338,6 +338,7 @@ def test_an_update_holds_only_after_it_was_made() -> None:
 def test_one_sensor_only_still_gives_the_world_and_one_that_sees_nobody_stays_uncalibrated() -> None:
     calibration = OnlineCalibration(("kinect1",))
     assert calibration.current_update().result.poses.keys() == {"kinect1"}
+    assert calibration.status()[:2] == (1, "no skeleton of kinect1 yet")
     for sensor, skeleton, received in stream(5.0):
         assert calibration.push(sensor, skeleton, received) == []  # kinect2 is unknown
     assert calibration.status()[0] == 0

@@ -115,7 +115,9 @@ def test_the_exit_code_is_nonzero_for_a_problem(tmp_path: Path, capsys: pytest.C
     assert cli.main(["doctor", str(BAG)]) == cli.main(["doctor", "--bag", str(BAG)]) == 0
     assert "problems: 0, warnings: 0" in capsys.readouterr().out
     assert cli.main(["doctor", "--bag", str(tmp_path)]) == 1
-    assert "problem " in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "problem " in said
+    assert said.endswith("solve the problems first\n")
     with pytest.raises(SystemExit) as ended:
         cli.main(["doctor", "--bag"])
     assert ended.value.code == 2
