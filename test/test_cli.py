@@ -58,7 +58,7 @@ def test_without_ros_it_says_how_to_install_it(
     monkeypatch.setattr(advice, "find_spec", lambda name: None)
     assert cli.main([]) == 0
     text = capsys.readouterr().out
-    assert "pip install 'body_tracking[ros]'" in text and "body_tracking replay" in text
+    assert "pip install 'ros-jazzy-rclpy==" in text and "body_tracking replay" in text
     assert "body_tracking up" not in text
 
 

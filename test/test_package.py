@@ -19,6 +19,7 @@ import yaml
 
 import body_tracking
 from body_tracking import systems
+from body_tracking.core.extras import REQUIREMENTS
 from body_tracking.pipeline import graph
 from domains import domain
 
@@ -157,6 +158,16 @@ def test_every_import_is_a_declared_dependency(manifest: ElementTree.Element, wh
             assert re.search(rf"pip install .*\b{distribution}\b", readme), f"{distribution}: no pip line in README.md"
         else:
             assert rosdep_key in declared, f"{where} imports {module}: package.xml does not declare {rosdep_key}"
+
+
+def test_the_extras_that_messages_name_are_those_of_setup_py() -> None:
+    text = (ROOT / "setup.py").read_text()
+    found = next(
+        ast.literal_eval(keyword.value)
+        for keyword in ast.walk(ast.parse(text))
+        if isinstance(keyword, ast.keyword) and keyword.arg == "extras_require"
+    )
+    assert {extra: tuple(found[extra]) for extra in REQUIREMENTS} == REQUIREMENTS
 
 
 # --- the wheel

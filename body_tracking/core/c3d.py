@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.extras import pip_install
 from body_tracking.core.files import open_regular
 from body_tracking.core.skeleton import FloatArray
 
@@ -82,7 +83,7 @@ def read_points(path: Path) -> C3dPoints:
     try:
         ezc3d: Any = importlib.import_module("ezc3d")
     except ImportError as error:
-        raise MarkerError(f"{path}: C3D files need ezc3d ({error}): pip install 'body_tracking[c3d]'") from error
+        raise MarkerError(f"{path}: C3D files need ezc3d ({error}): {pip_install('c3d')}") from error
     try:
         file = ezc3d.c3d(str(path))
         parameters = file["parameters"]

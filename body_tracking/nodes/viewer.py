@@ -25,6 +25,7 @@ from std_srvs.srv import Trigger
 from body_tracking import systems
 from body_tracking.core import names
 from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.extras import pip_install
 from body_tracking.core.parameters import Parameter, Value
 from body_tracking.core.qos import LATCHED, LATEST, RELIABLE, Qos, request_for
 from body_tracking.core.sensor_poses import SensorPose
@@ -149,7 +150,7 @@ class ViewerNode(GraphNode):
         try:
             from body_tracking.viewing.page import Page
         except ImportError as error:
-            raise PageError(f"the page needs viser ({error}): pip install 'body_tracking[viewer]'") from error
+            raise PageError(f"the page needs viser ({error}): {pip_install('viewer')}") from error
         self.views: list[SystemView] = [
             load(each.make)(given[each.option]) for each in systems.VIEWS if given[each.option]
         ]

@@ -9,6 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Final, TypeAlias
 
+from body_tracking.core.extras import pip_install
 from body_tracking.ros import dds
 from body_tracking.ros.up import flags, has_sensors
 
@@ -23,7 +24,7 @@ def steps(folder: Path) -> Iterator[Step]:
     """The possible next steps in a folder, the most likely first."""
     page = " --viewer" if find_spec("viser") is not None else ""
     if find_spec("rclpy") is None:
-        ways = ("pip install 'body_tracking[ros]'", ". /opt/ros/jazzy/setup.bash")
+        ways = (pip_install("ros"), ". /opt/ros/jazzy/setup.bash")
         yield "The client library of ROS is not here, so no graph can run. Install it, or source a ROS install:", ways
         yield from _recordings(folder, page, live=False)
         return
@@ -38,7 +39,7 @@ def steps(folder: Path) -> Iterator[Step]:
             )
     yield from _recordings(folder, page, live=True)
     if not page:
-        yield "The live page in a browser needs viser:", ("pip install 'body_tracking[viewer]'",)
+        yield "The live page in a browser needs viser:", (pip_install("viewer"),)
 
 
 def _domain(page: str) -> Iterator[Step]:

@@ -20,6 +20,7 @@ from typing import Final, Literal
 
 from body_tracking.core import names
 from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.extras import pip_install
 from body_tracking.core.message_types import IMU, JOINT_STATE, POINT_CLOUD
 from body_tracking.pipeline import graph
 
@@ -30,15 +31,15 @@ PROBLEM: Final = "problem"
 NEEDED = ("filterpy", "vqf", "mcap", "lz4", "zstandard", "rosbags")
 """Required libraries that no ROS install contains."""
 OPTIONAL = {
-    "viser": ("no live page", "pip install 'body_tracking[viewer]'"),
-    "ezc3d": ("no import of C3D files", "pip install 'body_tracking[c3d]'"),
+    "viser": ("no live page", pip_install("viewer")),
+    "ezc3d": ("no import of C3D files", pip_install("c3d")),
     "tf2_msgs": ("no /tf, so no frames in RViz", "where ROS is installed: sudo apt install ros-jazzy-tf2-msgs"),
     "hri_msgs": ("no /humans/bodies/tracked (REP-155)", "where ROS is installed: sudo apt install ros-jazzy-hri-msgs"),
 }
 _RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 _FAST_DDS = ("FASTDDS_BUILTIN_TRANSPORTS", "FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 _REMEDIES = {
-    "No module named 'rclpy'": "pip install 'body_tracking[ros]', or . /opt/ros/jazzy/setup.bash",
+    "No module named 'rclpy'": f"{pip_install('ros')}, or . /opt/ros/jazzy/setup.bash",
     "RMW": "unset RMW_IMPLEMENTATION, or install the middleware that it names",
     "shared object file": "unset _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH, in a shell without another ROS",
 }

@@ -28,6 +28,7 @@ import yaml
 
 from body_tracking.core import names
 from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.extras import pip_install
 from body_tracking.core.parameters import SECTION, Value, to_ros
 from body_tracking.core.signals import signals_held
 from body_tracking.core.skeleton import NANOSECONDS
@@ -533,7 +534,7 @@ def arguments_from(words: Sequence[str]) -> argparse.Namespace:
 
 def no_ros(error: ImportError) -> UpError:
     """The error of a command that needs ROS where ROS cannot be imported."""
-    return UpError(f"no ROS here ({error}): pip install 'body_tracking[ros]', or source a ROS install")
+    return UpError(f"no ROS here ({error}): {pip_install('ros')}, or source a ROS install")
 
 
 def _sensors_there(namespace: str) -> Mapping[str, Value]:

@@ -17,6 +17,7 @@ from typing import Any, Final
 
 from body_tracking.core import names
 from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.extras import pip_install
 from body_tracking.core.parameters import Value
 from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.node_parameters import parameters_for
@@ -115,7 +116,7 @@ def _choose(
     try:
         from body_tracking.viewing.start_page import StartPage
     except ImportError as error:
-        raise UpError(f"the page needs viser ({error}): pip install 'body_tracking[viewer]'") from error
+        raise UpError(f"the page needs viser ({error}): {pip_install('viewer')}") from error
     from body_tracking.filters import FILTERS
     from body_tracking.kinematics.tracking import ALL_CONVENTIONS
     from body_tracking.ros.discovery import Domain, Watch

@@ -3,7 +3,7 @@
 Starts ``body_tracking up`` over a bag with the robot's mapping file, follows the commands in MuJoCo, and prints and
 draws the resulting motion. Without ``--bag`` only the arm runs, until Ctrl-C, for a graph that is started elsewhere:
 ``body_tracking up --robot config/robots/two_joint_arm.yaml``. With ``--angles`` no filter runs: the bag holds joint
-angles already. Needs ROS, and ``pip install 'body_tracking[examples]'``.
+angles already. Needs ROS, and ``pip install -e '.[examples]'`` in the clone.
 """
 
 from __future__ import annotations
