@@ -329,4 +329,5 @@ def _print_summary(recording: SimulatedRecording, folder: Path) -> None:
     size = sum(path.stat().st_size for path in folder.iterdir())
     count = sum(len(samples.stamps_ns) for _, samples in recording.imus)
     inertial = f", {count} inertial samples" if count else ""
-    print(f"{folder}: {recording.duration:.1f} s, {len(recording.frames)} frames{inertial}, {size / 1e6:.2f} MB")
+    said = f"{recording.setup.motion}, {recording.duration:.1f} s, {len(recording.frames)} frames{inertial}"
+    print(f"{folder}: {said}, {size / 1e6:.2f} MB")
