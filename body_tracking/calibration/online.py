@@ -737,7 +737,7 @@ class OnlineCalibration:
             other.loaded = None
             other.forget()
             other.quality = SensorQuality()
-        return "calibrating: stand still (a T-pose is best) for two seconds, then walk about"
+        return "calibrating: stand still (a T-pose is best) for four seconds, then walk about"
 
     def reset(self) -> str:
         """Delete every calibration and start again."""

@@ -186,7 +186,7 @@ class InertialTracker:
         """Align again in the next pose that is held; returns the instruction for the caller."""
         self._asked_until = self._last + _ASKED_S
         pose = {AUTO: "a T-pose, or arms hanging", T_POSE: "a T-pose", ARMS_DOWN: "arms hanging"}[self.parameters.pose]
-        return f"hold {pose}, for a second and within the next {_ASKED_S:.0f} s"
+        return f"hold {pose} for four seconds, within the next {_ASKED_S:.0f} s"
 
     @property
     def alignment(self) -> Alignment:
