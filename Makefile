@@ -65,6 +65,7 @@ demo: $(STAMP) ## play a shipped recording through the real graph; joint angles,
 	$(BIN)/body_tracking up --bag $(DEMO_BAG) --record $(DEMO)/recording --log-dir $(DEMO)/log
 	$(BIN)/body_tracking show $(DEMO)/recording --truth $(DEMO_BAG) --output $(DEMO)/joint_angles.png
 	@echo "recording: $(DEMO)/recording"
+	@echo "next: . $(BIN)/activate, then body_tracking view"
 
 demo-markers: $(STAMP) ## the same with images of infrared markers: from balls to joint angles, beside the truth
 	@rm -rf $(DEMO_MARKERS) && mkdir $(DEMO_MARKERS)
