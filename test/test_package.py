@@ -11,6 +11,7 @@ import sys
 import tarfile
 import zipfile
 from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -19,7 +20,7 @@ import yaml
 
 import body_tracking
 from body_tracking import systems
-from body_tracking.core.extras import REQUIREMENTS
+from body_tracking.core.extras import pip_install
 from body_tracking.pipeline import graph
 from domains import domain
 
@@ -160,14 +161,14 @@ def test_every_import_is_a_declared_dependency(manifest: ElementTree.Element, wh
             assert rosdep_key in declared, f"{where} imports {module}: package.xml does not declare {rosdep_key}"
 
 
-def test_the_extras_that_messages_name_are_those_of_setup_py() -> None:
-    text = (ROOT / "setup.py").read_text()
-    found = next(
-        ast.literal_eval(keyword.value)
-        for keyword in ast.walk(ast.parse(text))
-        if isinstance(keyword, ast.keyword) and keyword.arg == "extras_require"
-    )
-    assert {extra: tuple(found[extra]) for extra in REQUIREMENTS} == REQUIREMENTS
+def test_messages_name_the_libraries_of_an_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert pip_install("c3d") == "pip install 'ezc3d>=1.7'"
+
+    def lacking(name: str) -> list[str]:
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr("importlib.metadata.requires", lacking)
+    assert pip_install("c3d") == "pip install -e '.[c3d]'"
 
 
 # --- the wheel

@@ -1,21 +1,15 @@
-"""Libraries that only parts of the package need (the extras of ``setup.py``), and the command that installs them."""
+"""The command that installs what only a part of the package needs: an extra of ``setup.py``."""
 
 from __future__ import annotations
-
-from typing import Final
-
-REQUIREMENTS: Final = {
-    "ros": (
-        "ros-jazzy-rclpy==7.1.6",
-        "ros-jazzy-common-interfaces==5.3.6",
-        "ros-jazzy-rmw-fastrtps-cpp==8.4.3",
-    ),
-    "viewer": ("viser>=1.1,<2", "trimesh>=3.21.7", "websockets>=14"),
-    "c3d": ("ezc3d>=1.7",),
-}
-"""By extra; equal to those of ``setup.py``."""
 
 
 def pip_install(extra: str) -> str:
     """The command that installs an extra's libraries; it works beside a clone and beside an installed wheel."""
-    return f"pip install {' '.join(repr(requirement) for requirement in REQUIREMENTS[extra])}"
+    from importlib.metadata import PackageNotFoundError, requires
+
+    try:
+        given = [each.partition(";") for each in requires("body_tracking") or ()]
+    except PackageNotFoundError:  # only the sources are on the path: they lie in a clone
+        return f"pip install -e '.[{extra}]'"
+    wanted = [library.strip() for library, _, condition in given if f'extra == "{extra}"' in condition]
+    return f"pip install {' '.join(repr(each) for each in wanted)}"
