@@ -30,8 +30,8 @@ PARAMETERS = (
     Parameter(
         "folder",
         "",
-        "the bag; an existing one is continued. Empty for body_tracking_<date> in the working directory. May change "
-        "between recorder/stop and recorder/start",
+        "the bag; an existing one is continued. Empty for body_tracking_<date and time> in the working directory, a "
+        "new one at each start of a recording. May change between recorder/stop and recorder/start",
         live=True,
     ),
     Parameter(
@@ -99,14 +99,21 @@ class BagRecorder(GraphNode):
 
     last_ns: int | None
     """Simulated time of the last message."""
+    folder: Path | None = None
+    """The current bag, or the last one; None before the first recording where the parameter is empty."""
 
     def configure(self, values: Mapping[str, Value]) -> None:
         given: dict[str, Any] = dict(values)
-        self.folder = Path(given["folder"] or f"body_tracking_{datetime.now():%Y_%m_%d-%H_%M_%S}").expanduser()
-        self.first, self.last_ns = self.folder, None
+        self.named = bool(given["folder"])
+        if self.named:
+            self.use_folder(Path(given["folder"]).expanduser())
         self.chosen = frozenset(map(self.resolve_topic_name, given["topics"]))
         self.exclude = frozenset(map(self.resolve_topic_name, given["exclude"]))
         self.model_covariance = bool(given["model_covariance"])
+
+    def use_folder(self, folder: Path) -> None:
+        self.folder = self.first = folder
+        self.last_ns = None
 
     def reconfigure(self, values: Mapping[str, Value]) -> None:
         """Apply the parameters to the next recording; BagError while a bag is being recorded."""
@@ -141,6 +148,10 @@ class BagRecorder(GraphNode):
             BagError: the bag cannot be written.
         """
         if self.writer is None:
+            if not self.named:
+                dated = Path(f"body_tracking_{datetime.now():%Y_%m_%d-%H_%M_%S}")
+                self.use_folder(_next_to(dated) if dated.exists() else dated)
+                self.written = 0
             self.open(self.now_ns() if self.simulated else None)
             self.error = ""
             # After a failure the subscriptions still exist, but the new file lacks their topics.
@@ -159,11 +170,11 @@ class BagRecorder(GraphNode):
         """
         if now_ns is not None and jumped_back(now_ns, self.last_ns):
             before, self.written = self.folder, 0
-            rounds = (self.first.with_name(f"{self.first.name}_{number}") for number in itertools.count(2))
-            self.folder = next(each for each in rounds if not each.exists())
+            self.folder = _next_to(self.first)
             self.get_logger().warning(f"time has jumped back: {before} is complete, {self.folder} goes on")
         self.last_ns = now_ns
         interval: Any = self.values["chunk_seconds"]
+        assert self.folder is not None
         self.writer = BagWriter(self.folder, resume=True, flush_interval_s=interval)
         self.get_logger().info(f"recording into {self.writer.path}")
 
@@ -183,7 +194,7 @@ class BagRecorder(GraphNode):
         if writer is not None:
             self.written += writer.message_count
             writer.close()
-        return f"{self.written} messages in {self.folder}"
+        return "nothing was recorded" if self.folder is None else f"{self.written} messages in {self.folder}"
 
     def answer(self, action: Callable[[], str], _: Any, response: Any) -> Any:
         """Callback of ``recorder/start`` and ``recorder/stop``."""
@@ -360,6 +371,12 @@ class BagRecorder(GraphNode):
             self.forget_early()
             return 1, f"waiting for {graph.CLOCK_TOPIC} (use_sim_time): nothing is recorded", values
         return (1 if self.refused else 0), ("stopped" if self.writer is None else "recording"), values
+
+
+def _next_to(folder: Path) -> Path:
+    """The folder's name with the first number from 2 that no other folder has."""
+    numbered = (folder.with_name(f"{folder.name}_{number}") for number in itertools.count(2))
+    return next(each for each in numbered if not each.exists())
 
 
 main = partial(run, BagRecorder)

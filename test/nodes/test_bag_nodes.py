@@ -7,6 +7,7 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterator
+from datetime import datetime
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -358,6 +359,25 @@ def test_recording_is_started_and_stopped_by_service(bench, tmp_path):
     with BagReader(folder) as reader:
         # Topics of the nodes themselves (all but /clock, /rosout, /parameter_events) were recorded, too.
         assert "/talk" in reader.topics and "/diagnostics" in reader.topics and "/rosout" not in reader.topics
+
+
+def test_a_recording_without_a_name_is_named_by_the_time_at_which_it_starts(bench, tmp_path):
+    given = ["--ros-args", "-p", "start_recording:=false"]
+    log = tmp_path / "bag_recorder.log"
+    recorder = bench.processes["bag_recorder"] = NodeProcess("bag_recorder", given, log, bench.environment, tmp_path)
+    assert bench.trigger("/recorder/stop").message == "nothing was recorded"
+    made: set[str] = set()
+    for _ in range(3):
+        pressed = datetime.now().replace(microsecond=0)
+        name = bench.trigger("/recorder/start").message.removeprefix("recording into ")
+        began = datetime.strptime(name[: len("body_tracking_2000_01_01-00_00_00")], "body_tracking_%Y_%m_%d-%H_%M_%S")
+        assert pressed <= began <= datetime.now()
+        assert bench.trigger("/recorder/stop").message.endswith(f" messages in {name}")
+        made.add(name)
+        bench.until(lambda: False, 0.7)  # two of them may start in one second
+    assert len(made) == 3
+    assert {path.name for path in tmp_path.iterdir() if path.is_dir()} == made
+    bench.finished(recorder, signal.SIGINT)
 
 
 @pytest.mark.parametrize(
