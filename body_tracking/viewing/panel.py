@@ -55,7 +55,6 @@ class ControlPanel:
         self._server, self._controls, self._sensors = server, controls, tuple(sensors)
         self._start_page, self._plays = start_page, plays
         gui = server.gui
-        self._state = gui.add_html(state_html({}, 0.0))
         self._groups: dict[str, list[Any]] = {}
         with gui.add_folder("Control"):
             for label, (node, services) in BUTTONS.items():
@@ -68,6 +67,8 @@ class ControlPanel:
             self._convention = self._choice("angles", conventions, self._controls.choose_convention)
             self._body = self._choice("person", (NONE,), self._controls.choose_body)
             self._groups["skeleton_filter"], self._groups["joint_angles"] = [self._filter], [self._convention]
+        # Below the buttons: its number of lines changes, and must not move a button under the mouse.
+        self._state = gui.add_html(state_html({}, 0.0))
         self._running: dict[str, str] = {}
         """Last reported filter, convention and loop state, by node."""
         # For the server's event loop: only reports after this steady time move the slider.

@@ -114,6 +114,10 @@ class Browser:
         """Click on one of the points that the page draws there."""
         self.page.mouse.click(*self.page.evaluate(ON_SCREEN, [name, index]))
 
+    def places(self, *buttons: str) -> list[Any]:
+        """Where the buttons are: x, y, width and height in pixels."""
+        return [self.page.get_by_role("button", name=each, exact=True).bounding_box() for each in buttons]
+
     def labels(self) -> list[str]:
         """The names in the scene."""
         return list(self.page.evaluate(LABELS))
@@ -160,14 +164,15 @@ class Browser:
         return bytes(self.page.screenshot(clip=clip, timeout=1e3 * PATIENCE))
 
     def save(self, name: str, height: int | None = None) -> None:
-        """A picture for the documentation, if these are asked for: of the page, or the top of its right panel."""
+        """A picture for the documentation, if these are asked for: of the page, or of the state in words and below."""
         if PICTURES:
             file = Path(PICTURES) / name
             file.parent.mkdir(parents=True, exist_ok=True)
             self.close_notes()
             self.page.wait_for_timeout(5e3)
             size = self.page.viewport_size
-            panel = {"x": size["width"] - 292, "y": 56, "width": 292, "height": height or 0}
+            top = self.page.locator("div[style*='line-height:1.35']").first.bounding_box()["y"]
+            panel = {"x": size["width"] - 292, "y": top, "width": 292, "height": height or 0}
             whole: dict[str, Any] = {} if height is None else {"clip": panel}
             self.page.screenshot(path=file, timeout=1e3 * PATIENCE, **whole)
 

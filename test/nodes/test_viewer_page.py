@@ -119,6 +119,8 @@ def test_a_browser_shows_the_graph_and_its_buttons_work(browser: Browser, tmp_pa
     # Buttons.
     browser.press("calibrate")
     assert "calibration/start" not in browser.answer("calibration: calibrate")
+    browser.until(lambda: "recording stopped" in browser.text(), "no recording")
+    places = browser.places("calibrate", "record", "pause")
     browser.press("record")
     assert "recording into" in browser.answer("recording: record")
     recorded, before = "bag_recorder", len(clouds)
@@ -126,6 +128,8 @@ def test_a_browser_shows_the_graph_and_its_buttons_work(browser: Browser, tmp_pa
         lambda: int(running.diagnostics.get(recorded, {}).get("messages", 0)) > 100 and len(clouds) > before + 20,
         "messages in the recording, twice as many filtered skeletons as are asked for",
     )
+    browser.until(lambda: "REC recording into" in browser.text(), "the recording in words")
+    assert browser.places("calibrate", "record", "pause") == places  # under a mouse that clicks twice
     browser.press("stop")
     assert "messages in" in browser.answer("recording: stop")
     with BagReader(tmp_path / "recorded") as reader:
