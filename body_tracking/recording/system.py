@@ -78,7 +78,7 @@ SYSTEM = System(
     ),
     topics=(TopicSpec(graph.CLOCK_TOPIC, CLOCK, RELIABLE, "bag_player", "the bag's time, for `use_sim_time`"),),
     services=(
-        Service("recorder/start", "bag_recorder", "start recording, into a new file of the same bag"),
+        Service("recorder/start", "bag_recorder", "start recording into a new folder, or a new file of the named one"),
         Service("recorder/stop", "bag_recorder", "stop recording and close the bag"),
         Service("bag_player/pause", "bag_player", "pause"),
         Service("bag_player/resume", "bag_player", "resume"),
