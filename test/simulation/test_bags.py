@@ -327,7 +327,7 @@ def test_all_options_take_effect(tmp_path: Path, capsys: pytest.CaptureFixture[s
         *("--imus", "hand_left,pelvis", "--raw", "--no-magnetometer", "--imu-rate", "50"),
     )
     line = capsys.readouterr().out.splitlines()[-1]
-    assert line.startswith(f"{folder}: 2.0 s, ") and "inertial samples" in line
+    assert line.startswith(f"{folder}: standing_still, 2.0 s, ") and "inertial samples" in line
     clouds = dict.fromkeys(map(graph.skeleton_topic, ("kinect1", "kinect2", "kinect3")), POINT_CLOUD)
     inertial = dict.fromkeys(("/imu_hand_left/imu/data_raw", "/imu_pelvis/imu/data_raw"), IMU)
     assert types(folder) == TRUTHS | clouds | inertial
