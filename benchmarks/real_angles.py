@@ -42,7 +42,7 @@ COVERED = 0.88
 """Bar: least share of the differences within 1.96 stated deviations."""
 
 
-def raised(angles: AngleSeries) -> FloatArray:
+def canonical(angles: AngleSeries) -> FloatArray:
     """(n, angles) radians, with ISB's elevation negative throughout.
 
     ISB's three angles of a shoulder, (plane, elevation, rotation) and (plane + pi, -elevation, rotation + pi), are one
@@ -64,7 +64,7 @@ def both(one: AngleSeries, two: AngleSeries, clock: ClockModel) -> dict[str, tup
     stamps = np.array([clock.to_reference(int(each)) for each in two.stamps_ns])
     matches = nearest(stamps, one.stamps_ns)
     here, there = np.flatnonzero(matches >= 0), matches[matches >= 0]
-    angles = raised(one)[here], raised(two)[there]
+    angles = canonical(one)[here], canonical(two)[there]
     found: dict[str, list[tuple[FloatArray, FloatArray]]] = {}
     for column, name in enumerate(one.names):
         other = two.names.index(name)

@@ -167,7 +167,7 @@ def test_messages_name_the_libraries_of_an_extra(monkeypatch: pytest.MonkeyPatch
     def lacking(name: str) -> list[str]:
         raise PackageNotFoundError(name)
 
-    monkeypatch.setattr("importlib.metadata.requires", lacking)
+    monkeypatch.setattr("body_tracking.core.extras.requires", lacking)
     assert pip_install("c3d") == "pip install -e '.[c3d]'"
 
 

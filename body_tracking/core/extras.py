@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from importlib.metadata import PackageNotFoundError, requires
+
 
 def pip_install(extra: str) -> str:
     """The command that installs an extra's libraries; it works beside a clone and beside an installed wheel."""
-    from importlib.metadata import PackageNotFoundError, requires
-
     try:
         given = [each.partition(";") for each in requires("body_tracking") or ()]
     except PackageNotFoundError:  # only the sources are on the path: they lie in a clone

@@ -112,6 +112,7 @@ class BagRecorder(GraphNode):
         self.model_covariance = bool(given["model_covariance"])
 
     def use_folder(self, folder: Path) -> None:
+        """Record into this folder from the next start on."""
         self.folder = self.first = folder
         self.last_ns = None
 

@@ -8,7 +8,6 @@ import time
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import rclpy
@@ -71,9 +70,7 @@ def problem_parts(statuses: Mapping[str, NodeStatus], *, bag_starts: bool = Fals
     return [f"{name}: {text}" for name, text in sorted(bad.items())]
 
 
-def losses_part(
-    statuses: Mapping[str, NodeStatus], before: Mapping[str, NodeStatus] = MappingProxyType({})
-) -> list[str]:
+def losses_part(statuses: Mapping[str, NodeStatus], before: Mapping[str, NodeStatus] | None = None) -> list[str]:
     """The messages that nodes did not process, where they are more than one in a hundred received ones.
 
     Args:
@@ -85,7 +82,7 @@ def losses_part(
         if name in _SHOWING:
             continue
         lost, received = _losses(status)
-        if name in before:
+        if before and name in before:
             earlier = _losses(before[name])
             if earlier[0] <= lost and earlier[1] <= received:  # the node was not started anew
                 lost, received = lost - earlier[0], received - earlier[1]
