@@ -2,18 +2,22 @@
 
 The images of the shipped recording (480x360 pixels, JPEG; depth at half the size) are published reliably to the nodes,
 over and over. The delay is from just before the colour image is published until the angles with its stamp are received,
-by one clock. ``beyond inference``: the median delay minus the networks' time for the images, measured in this process
-alone just before. ``lost``: images without angles; ``dropped``: images of either kind that the node's diagnostics count
-as dropped. ``cpu``: processor time of the camera node per pair of images that it uses, beside the networks' alone;
-other work on the machine changes it less. The bars assume a machine that does nothing else.
+by one clock. ``beyond inference``: the median delay minus the networks' time for an image, measured just before in as
+many processes at the same time as there are cameras, since each camera has a node. ``lost``: images without angles;
+``dropped``: images of either kind that the nodes' diagnostics count as dropped. ``cpu``: processor time of the camera
+nodes per pair of images that they use, beside the networks' alone; other work on the machine changes it less. The bars
+assume a machine that does nothing else.
 """
 
 from __future__ import annotations
 
+import itertools
+import multiprocessing
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +43,7 @@ from body_tracking.simulation.camera_bags import SHIPPED
 from body_tracking.systems import options_of
 
 BEYOND_MS = 15.0
-NODE = "camera_skeleton"
+EXECUTABLE = "camera_skeleton"
 
 
 def recorded() -> tuple[list[tuple[str, bytearray]], list[dict[str, bytearray]]]:
@@ -57,10 +61,11 @@ def recorded() -> tuple[list[tuple[str, bytearray]], list[dict[str, bytearray]]]
     return infos, pairs
 
 
-def inference_ms(pairs: list[dict[str, bytearray]]) -> tuple[float, float]:
+def inference_ms(number_of_images: int) -> tuple[float, float]:
     """Median wall and processor time of the networks for an image in which the person is tracked, milliseconds."""
     tracker, times = PersonTracker(PoseModel(default_folder(), int(str(THREADS.default))), 1, 0.3), []
-    for number, pair in enumerate(pairs[:60]):
+    _, pairs = recorded()
+    for number, pair in enumerate(itertools.islice(itertools.cycle(pairs), number_of_images)):
         _, _, image = CompressedColour().decode(bytes(pair["colour"]), BAG_WIRE)
         begin = time.perf_counter(), time.process_time()
         tracker.update(number * NANOSECONDS // 15, image)
@@ -69,15 +74,16 @@ def inference_ms(pairs: list[dict[str, bytearray]]) -> tuple[float, float]:
     return float(wall), float(processor)
 
 
-def used_pairs(bench: live.Bench) -> float:
-    """Pairs of images that the node has used so far."""
-    return sum(float(value) for key, value in bench.values(NODE).items() if key.endswith("pairs of images"))
+def used_pairs(bench: live.Bench, names: Sequence[str]) -> float:
+    """Pairs of images that the nodes of these cameras have used so far."""
+    return sum(float(bench.values(f"{name}_skeleton").get("pairs of images", 0)) for name in names)
 
 
 def measured(cameras: int, rate: float, seconds: float, warm_up: float) -> dict[str, Any]:
     """One run with this number of cameras."""
     infos, pairs = recorded()
-    networks, networks_cpu = inference_ms(pairs)
+    with ProcessPoolExecutor(cameras, mp_context=multiprocessing.get_context("spawn")) as pool:
+        networks, networks_cpu = np.mean(list(pool.map(inference_ms, [200] * cameras)), axis=0).tolist()
     names = [f"camera{number + 1}" for number in range(cameras)]
     topics = {name: DRIVERS["plain"].of(name) for name in names}
     bench = live.Bench("camera_live")
@@ -113,21 +119,21 @@ def measured(cameras: int, rate: float, seconds: float, warm_up: float) -> dict[
             time.sleep(1.0)
             bench.spin()
             commands = {tuple(each.args): psutil.Process(each.pid) for each in running}
-            (node,) = (each for words, each in commands.items() if NODE in words)
-            begun, before = live.cpu_seconds(node).sum(), used_pairs(bench)
+            nodes = [each for words, each in commands.items() if EXECUTABLE in words]
+            begun, before = sum(live.cpu_seconds(each).sum() for each in nodes), used_pairs(bench, names)
             counted = {topics[names[0]].colour + COMPRESSED: "angles"}
             bench.publish(events(), counted, 1.0 + warm_up)
             time.sleep(2.5)
-            used, after = live.cpu_seconds(node).sum() - begun, used_pairs(bench)
-        values = dict(bench.values(NODE))
+            used, after = sum(live.cpu_seconds(each).sum() for each in nodes) - begun, used_pairs(bench, names)
+        values = [dict(bench.values(f"{name}_skeleton")) for name in names]
     bench.close()
     delays, lost = bench.delays_ms("angles")
     return {
         **live.percentiles(delays, "the graph", 95),
         "lost": lost,
-        "dropped": sum(int(float(value)) for key, value in values.items() if "dropped" in key),
+        "dropped": sum(int(float(value)) for each in values for key, value in each.items() if "dropped" in key),
         "networks, ms": networks,
-        "beyond inference, ms": float(np.median(delays)) - cameras * networks,
+        "beyond inference, ms": float(np.median(delays)) - networks,
         "networks' cpu, ms": networks_cpu,
         "cpu, ms": 1e3 * float(used) / max(1.0, after - before),
     }

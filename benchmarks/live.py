@@ -82,8 +82,8 @@ def node_commands(folder: Path, options: Options, level: str = "WARN") -> list[l
             continue
         values = {name: to_ros(value) for name, value in {**spec.defaults, **spec.parameters}.items()}
         file = parameters_file(folder / f"{spec.name}.parameters.yaml", {spec.full_name: values})
-        line = ["-m", "body_tracking.nodes", spec.executable, "--ros-args", "--log-level", level]
-        lines.append([sys.executable, *line, "--params-file", file])
+        line = ["-m", "body_tracking.nodes", spec.executable, "--ros-args", "-r", f"__node:={spec.name}"]
+        lines.append([sys.executable, *line, "--log-level", level, "--params-file", file])
     return lines
 
 

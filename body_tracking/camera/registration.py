@@ -90,11 +90,10 @@ def moved(found: Landmarks, source: Camera, target: Camera) -> Landmarks:
         return found
     ratio = float(target.matrix[0, 0] / source.matrix[0, 0])
 
-    def place(pixels: FloatArray) -> FloatArray:
-        return target.to_pixels(target.distort(source.undistort(pixels)))
-
-    region = Region(place(found.region.centre), found.region.side * ratio, found.region.angle)
-    return replace(found, pixels=place(found.pixels), region=region)
+    there = np.vstack([found.pixels, found.region.centre])
+    there = target.to_pixels(target.distort(source.undistort(there)))
+    region = Region(there[-1], found.region.side * ratio, found.region.angle)
+    return replace(found, pixels=there[:-1], region=region)
 
 
 def prepare() -> None:

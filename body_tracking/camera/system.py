@@ -88,11 +88,14 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
             rig["compressed"] = True
         rig |= transport(options)
         yield NodeSpec("camera_rig", "camera_rig", defaults=_pictures(options), parameters=rig)
-    if _cameras(options):
-        own: dict[str, Value] = {"cameras": _cameras(options)}
-        own |= asked(options, driver="driver", model="pose_model", compressed="compressed")
-        own |= transport(options)
-        yield NodeSpec("camera_skeleton", "camera_skeleton", defaults=_pictures(options), parameters=own)
+    own = asked(options, driver="driver", model="pose_model", compressed="compressed") | transport(options)
+    for camera in _cameras(options):
+        yield NodeSpec(
+            f"{camera}_skeleton",
+            "camera_skeleton",
+            defaults=_pictures(options),
+            parameters={"camera": camera, **own},
+        )
 
 
 def _instead(topic: str, topics: Collection[str]) -> str:
@@ -167,7 +170,7 @@ SYSTEM = System(
             "the ROS driver of --camera and --camera-rig, which says on which topics it publishes (default: plain, "
             "/<sensor>/color/image_raw and /<sensor>/depth/image_raw)",
             choices=lambda: tuple(DRIVERS),
-            parameter=("camera_skeleton", "driver"),
+            parameter=("camera_skeleton", "driver"),  # in a section for all nodes; a camera's section is for its node
             offline=True,
         ),
         Option(

@@ -153,8 +153,10 @@ class Camera:
 
         NaN where it does not converge: far outside the image the polynomials are not monotonic.
         """
+        seen: FloatArray = (pixels - self.matrix[:2, 2]) / self.matrix[[0, 1], [0, 1]]
+        if not self.distortion.any():
+            return seen
         # by coordinate, in memory of its own: half the time of the pairs
-        seen = (pixels - self.matrix[:2, 2]) / self.matrix[[0, 1], [0, 1]]
         seen_x, seen_y = np.ascontiguousarray(seen[..., 0]), np.ascontiguousarray(seen[..., 1])
         x, y = seen_x, seen_y
         with np.errstate(all="ignore"):

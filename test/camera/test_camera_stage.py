@@ -18,6 +18,7 @@ from body_tracking.core.parameters import check_all
 from body_tracking.core.skeleton import Joint, Skeleton, TrackingState
 from body_tracking.core.sources import SensorNameError
 from body_tracking.mesh.depth import DepthError
+from body_tracking.node_parameters import parameters_for
 from body_tracking.pipeline.graph import GraphError
 from body_tracking.pipeline.stage import Now, Output
 from body_tracking.simulation.camera_bags import SECONDS
@@ -29,7 +30,7 @@ SEEN = [Joint[f"{name}_{side}"] for side in ("LEFT", "RIGHT") for name in ("SHOU
 
 
 def stage(**values: Any) -> CameraStage:
-    return CameraStage(check_all(CameraStage.PARAMETERS, {"cameras": ("camera1",), **values}))
+    return CameraStage(check_all(CameraStage.PARAMETERS, {"camera": "camera1", **values}))
 
 
 def now(stamp_ns: int) -> Now:
@@ -71,7 +72,7 @@ def test_the_joints_of_the_recorded_person_are_found_where_they_are() -> None:
         inside.append(np.einsum("ji,jik,jk->j", off, inverse, off) < 7.815)
     assert np.nanmedian(errors) < 0.04 and np.nanmean(errors) < 0.06
     assert np.mean(inside) > 0.85
-    assert node.counters["camera1 searches for people"] == 1  # then the person is followed
+    assert node.counters["searches for people"] == 1  # then the person is followed
     assert node.state(0)[:2] == (0, "")
 
 
@@ -84,7 +85,7 @@ def test_nobody_is_found_in_an_empty_room_and_a_lost_person_is_searched_for_agai
     assert show(node, first - 1_000_000_000, empty, recorded.depth[first]) == []
     assert len(show(node, first, recorded.colour[first], recorded.depth[first])) == 1
     assert show(node, stamps[1], empty, recorded.depth[first]) == []
-    assert node.counters["camera1 people lost"] == 1
+    assert node.counters["people lost"] == 1
     # at the next search, and as somebody else
     (again,) = show(node, stamps[8], recorded.colour[stamps[8]], recorded.depth[stamps[8]])
     assert again.body == 1
@@ -99,7 +100,7 @@ def test_images_within_the_tolerance_are_one_pair_and_others_are_counted() -> No
     assert skeleton.stamp_ns == stamps[0]
     assert show(node, stamps[3], colour, depth, stamps[3] + 30_000_000) == []
     assert list(node.poll(stamps[3] + 1_000_000_000)) == []
-    assert node.counters["camera1 images without the other one"] == 2
+    assert node.counters["images without the other one"] == 2
 
 
 @networks
@@ -109,7 +110,7 @@ def test_a_picture_of_a_person_gives_no_skeleton_and_is_named() -> None:
     wall = np.full_like(recorded.depth[stamp_ns], 2.2)
     assert show(node, stamp_ns, recorded.colour[stamp_ns], wall) == []
     level, text, _ = node.state(0)
-    assert level == 1 and "flat" in text and node.counters["camera1 pictures of people"] == 1
+    assert level == 1 and "flat" in text and node.counters["pictures of people"] == 1
 
 
 @networks
@@ -138,7 +139,7 @@ def test_somebody_in_a_mirror_is_another_person_or_a_picture(virtual: bool) -> N
     if virtual:
         assert depths[1] - depths[0] > 1.0
     else:
-        assert node.counters["camera1 pictures of people"] == 1
+        assert node.counters["pictures of people"] == 1
 
 
 @networks
@@ -178,7 +179,7 @@ def test_images_of_another_size_are_named_and_a_covered_lens() -> None:
     colour, depth = recorded.colour[stamps[0]], recorded.depth[stamps[0]]
     with pytest.raises(DepthError, match="240 x 180"):
         show(node, stamps[0], colour[::2, ::2], depth)
-    assert node.counters["camera1 colour images of another size"] == 1
+    assert node.counters["colour images of another size"] == 1
     assert show(node, stamps[1], colour, np.zeros_like(depth)) == []
     assert "covered" in node.state(0)[1]
     assert len(show(node, stamps[9], colour, depth)) == 1
@@ -193,13 +194,13 @@ def test_a_jump_back_forgets_the_people() -> None:
         show(node, stamp_ns, recorded.colour[stamp_ns], recorded.depth[stamp_ns])
     node.reset(NAMES.colour)
     assert len(show(node, stamps[0], recorded.colour[stamps[0]], recorded.depth[stamps[0]])) == 1
-    assert node.counters["camera1 searches for people"] == 2
+    assert node.counters["searches for people"] == 2
 
 
 @networks
 def test_pictures_are_published_at_their_rate_while_somebody_looks() -> None:
     recorded, wanted = recording(), set[str]()
-    values = check_all(CameraStage.PARAMETERS, {"cameras": ("camera1",), "picture_rate": 5.0})
+    values = check_all(CameraStage.PARAMETERS, {"camera": "camera1", "picture_rate": 5.0})
     node = CameraStage(values, lambda topic: topic in wanted)
     node.take(NAMES.colour_info, recorded.colour_camera, now(0))
     node.take(NAMES.depth_info, recorded.depth_camera, now(0))
@@ -231,10 +232,23 @@ def test_topics_follow_driver_compression_and_the_lab() -> None:
 
 
 @networks
-@pytest.mark.parametrize("names", [(), ("camera1", "camera1"), ("1st",)])
-def test_invalid_cameras_are_refused(names: tuple[str, ...]) -> None:
-    with pytest.raises((GraphError, SensorNameError), match=r"camera|name"):
-        stage(cameras=names)
+@pytest.mark.parametrize("name", ["", "1st"])
+def test_invalid_names_are_refused(name: str) -> None:
+    with pytest.raises(SensorNameError, match="name"):
+        stage(camera=name)
+
+
+def test_each_camera_has_a_node_with_parameters_of_its_own(tmp_path: Path) -> None:
+    file = tmp_path / "cameras.yaml"
+    file.write_text(
+        "/**: {ros__parameters: {search_every: 1.0}}\n"
+        "camera2_skeleton: {ros__parameters: {driver: orbbec, depth_pose: ['0.1', '0', '0', '0', '0', '0', '1']}}\n"
+    )
+    found = parameters_for(nodes_for(options_of(camera=("camera1", "camera2"))), file)
+    drivers = [found[f"{name}_skeleton"].get("driver", "plain") for name in ("camera1", "camera2")]
+    assert drivers == ["plain", "orbbec"]
+    assert "depth_pose" not in found["camera1_skeleton"]
+    assert all(found[f"{name}_skeleton"]["search_every"] == 1.0 for name in ("camera1", "camera2"))
 
 
 def test_missing_and_foreign_networks_are_named(tmp_path: Path) -> None:

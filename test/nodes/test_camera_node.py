@@ -42,7 +42,7 @@ def test_images_become_skeletons_and_angles_with_deviations(tmp_path: Path) -> N
 @pytest.mark.skipif(bool(MISSING), reason=REASON)
 def test_a_driver_that_does_not_run_is_reported_with_the_topics_that_are_missing(tmp_path: Path) -> None:
     with Running(tmp_path) as running:
-        running.start("camera_skeleton", cameras='["camera1"]', driver="realsense")
+        running.start("camera_skeleton", camera="camera1", driver="realsense")
         assert running.until(lambda: running.said("camera_skeleton").get("level") == "1", timeout=60.0)
     text = running.said("camera_skeleton")[""]
     assert text.startswith("nothing arrives on ") and "/camera/camera1/color/image_raw" in text

@@ -37,7 +37,6 @@ NEEDED: dict[str, dict[str, object]] = {
     "robot_commands": {"mapping": ROOT / "config" / "robots" / "iiwa7.yaml"},
     "bag_player": {"bag": BAG},
     "mesh_tracker": {"depth": "[kinect1]"},
-    "camera_skeleton": {"cameras": "[camera1]"},
     "camera_rig": {"setup": ROOT / "config" / "camera_rig"},
     "bag_recorder": {"start_recording": False},
     "viewer": {"port": 0},

@@ -18,7 +18,7 @@ MARKER_NODES = (
     "rigid_body_tracker",
     "marker_joint_angles",
 )
-LACKING = ("robot_commands", "bag_player", "kinect_skeleton", "mesh_tracker", "camera_skeleton", "camera_rig")
+LACKING = ("robot_commands", "bag_player", "kinect_skeleton", "mesh_tracker", "camera_rig")
 """Nodes that do nothing without a parameter."""
 NODES = startable(systems.EXECUTABLES)
 GROUPS = 4
@@ -37,7 +37,6 @@ class Nodes:
             "robot_commands": {"mapping": mapping},
             "bag_player": {"bag": bag, "topics": "[/kinect2/skeleton]", "start_paused": "true"},
             "mesh_tracker": {"depth": "[kinect1]"},
-            "camera_skeleton": {"cameras": "[camera1]"},
             "camera_rig": {"setup": tools.share / "config" / "camera_rig"},
             "bag_recorder": {"folder": "recording", "start_recording": "false"},
             "viewer": {"port": 0},
