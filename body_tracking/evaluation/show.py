@@ -93,8 +93,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     if args.output is not None and args.output.suffix.lower() != ".png":
         raise EvaluationError(f"{args.output}: expected a name that ends in .png")
-    table = summarise(args.bag, args.output, args.body, args.truth)
-    print(f"{table.text()}\n{table.note}")
+    tracked = read(args.bag, args.body, args.truth)
+    table = summary(tracked.angles, tracked.true_angles)
+    print(f"{table.text()}\n{table.note}", flush=True)  # drawing takes seconds
     if args.output is not None:
+        make_folder(args.output)
+        draw(tracked, args.output)
         print(f"\npicture: {args.output}")
     return 0

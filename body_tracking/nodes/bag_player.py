@@ -32,7 +32,7 @@ PARAMETERS = (
     Parameter(
         "position",
         0.0,
-        "set while the bag plays: continue at this place, seconds from its beginning",
+        "set while the bag plays, or idles at its end: continue at this place, seconds from its beginning",
         unit="s",
         min=0.0,
         live=True,
@@ -54,7 +54,12 @@ PARAMETERS = (
     ),
     Parameter("wait_timeout", 30.0, "start without subscribers after this; 0 to wait without limit", unit="s", min=0.0),
     Parameter("start_paused", False, "wait for ~/resume before the first message"),
-    Parameter("on_end", "exit", "what to do after the last message", choices=("exit", "idle")),
+    Parameter(
+        "on_end",
+        "exit",
+        "what to do after the last message; while it idles, position and loop play it again",
+        choices=("exit", "idle"),
+    ),
 )
 
 _LOOK_NS = 20_000_000  # between two counts of subscribers
@@ -75,10 +80,13 @@ class BagPlayer(GraphNode):
         if self.playback is not None:
             self.playback.set_rate(given["rate"], time.monotonic_ns())
             self.playback.loop = given["loop"]
+            ended = self.phase == "at the end"
             if given["position"] != self.values["position"]:
-                if self.phase == "at the end":
+                if ended and given["on_end"] == "exit":
                     raise BagError("the bag has ended")
                 self.playback.seek(given["position"], time.monotonic_ns())
+            if ended and not self.playback.finished:
+                self.phase = "playing"
             if self.phase == "playing":
                 self.wake(0)
 

@@ -58,17 +58,19 @@ def state_html(
         return block([line(ORANGE, "waiting", "no node has reported yet")])
     if plays and PLAYER not in there:
         return block([line(GREY, "waiting", "the recording starts once all nodes have started")])
-    lines = [*_input(there, sensors), _calibration(there), _recording(there)]
+    lines = [*_input(there, sensors, start_page), _calibration(there), _recording(there)]
     return block([each for each in lines if each])
 
 
-def _input(there: Mapping[str, NodeStatus], sensors: Sequence[str]) -> list[str]:
+def _input(there: Mapping[str, NodeStatus], sensors: Sequence[str], start_page: bool) -> list[str]:
     """The bag, and the rate of each sensor while it plays; with a bag only of the sensors in diagnostics."""
     lines = []
     if (player := there.get(PLAYER)) is not None:
         bag = Path(player.values.get("bag", "")).name
         position, duration = player.number("position s") or 0.0, player.number("duration s") or 0.0
         again = ", again and again" if player.values.get("loop") == "True" else ""
+        if start_page and player.text == "at the end":
+            again = ": <i>time</i> plays it again from any place, <i>end</i> leads back to the list"
         words = f"<b>{html.escape(bag)}</b>, {position:.1f} of {duration:.1f} s{again}"
         colour = {"playing": GREEN, "paused": GREY, "at the end": GREY}.get(player.text, ORANGE)
         lines.append(line(colour, html.escape(player.text), words))

@@ -287,6 +287,10 @@ def test_start_offset_and_topics(bench, tmp_path):
     bench.wait_until(lambda: texts and texts[-1].data.startswith("118 "), "the last message")
     assert [int(text.data.split()[0]) for text in texts] == list(range(61, 120, 3))
     assert left == [] and player.poll() is None, "it idles at the end"
+    texts.clear()
+    assert bench.set_parameter("bag_player", "position", ParameterValue(type=3, double_value=0.9)) == (True, "")
+    bench.wait_until(lambda: texts and texts[-1].data.startswith("118 "), "the last message again")
+    assert [int(text.data.split()[0]) for text in texts] == list(range(91, 120, 3))
     bench.finished(player, signal.SIGINT)
 
 

@@ -141,6 +141,14 @@ def test_from_the_start_page_to_a_recording_and_back(start_page: Browser) -> Non
     choose(browser, "angles", "isb")
     browser.answer("angles isb")
 
+    page.get_by_label("loop").dispatch_event("click")
+    browser.answer("ends at its end")
+    browser.reads(r"at the end mine, 15\.\d of 15\.4 s: time plays it again from any place, end leads back to the list")
+    assert page.locator("input[value^='left']").count() >= 3  # the curves stay
+    page.get_by_role("slider").first.press("Home")
+    browser.answer("plays on from 0.0 s")
+    browser.reads(r"playing mine, [\d.]+ of 15\.4 s")
+
     browser.press("end")
     texts: list[str] = []
 

@@ -73,6 +73,12 @@ def test_a_paused_bag_is_no_fault() -> None:
     assert ORANGE not in text and text.count(GREY) == 2
 
 
+def test_at_the_end_of_a_recording_the_page_says_how_to_go_on() -> None:
+    at_end = {"bag_player": NodeStatus("bag_player: stream", 0, "at the end", PLAYER)}
+    assert "leads back to the list" in state_html(at_end, 0.0, start_page=True)
+    assert "leads back" not in state_html(at_end, 0.0)
+
+
 def test_the_end_and_the_next_step_are_shown() -> None:
     running = {"fusion": NodeStatus("fusion: stream", 0, "OK", {}, 10.0)}
     assert "has ended" not in state_html(running, 10.5)
