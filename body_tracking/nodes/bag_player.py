@@ -73,6 +73,7 @@ class BagPlayer(GraphNode):
     PARAMETERS = PARAMETERS
 
     playback: Playback | None = None
+    phase = "waiting for subscribers"
     clock_ns = 0
 
     def configure(self, values: Mapping[str, Value]) -> None:
@@ -118,7 +119,6 @@ class BagPlayer(GraphNode):
         self.warn_of_damage()
         for service, paused in (("~/pause", True), ("~/resume", False), ("~/toggle_paused", None)):
             self.create_service(Trigger, service, partial(self.set_paused, paused))
-        self.phase = "waiting for subscribers"
         self.give_up_ns = time.monotonic_ns() + round((given["wait_timeout"] or 1e9) * NANOSECONDS)
         self.alarm = self.create_timer(1.0, self.wait, clock=STEADY)
         self.wake(0)

@@ -45,8 +45,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser(
         "view",
         description="Open a page in the browser that lists recordings, sensors that publish and nodes. What is chosen "
-        "there runs as with body_tracking up, and the page shows it until end is pressed; then the list is back. Ends with "
-        "Ctrl-C.",
+        "there runs as with body_tracking up, and the page shows it; graph: end leads back to the list. Ctrl-C ends.",
         epilog="The options hold for all that is started from the page.",
     )
     add_options(parser, *(name for name, each in OPTIONS.items() if not each.hidden and name not in _NOT_HERE))
@@ -70,10 +69,11 @@ def run(args: argparse.Namespace) -> int:
             port, choice, found = _choose(args, host, port, *said, choice)
             what = choice.bag.name if choice.bag is not None else "the graph"
             try:
-                viewer: dict[str, Value] = {"host": host, "port": port, "start_page": True}
-                supervisor = supervise(
-                    _graph(args, choice), found, {"viewer": viewer, "bag_player": {"on_end": "idle"}}
-                )
+                settings: dict[str, dict[str, Value]] = {
+                    "viewer": {"host": host, "port": port, "start_page": True},
+                    "bag_player": {"on_end": "idle"},  # the curves stay
+                }
+                supervisor = supervise(_graph(args, choice), found, settings)
             except BodyTrackingError as error:
                 said = str(error), "failed"
                 continue
