@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import fields
 
+import numpy as np
 import pytest
 from rcl_interfaces.msg import ParameterType, ParameterValue
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState, PointCloud2
@@ -20,7 +21,7 @@ from body_tracking.ros.bag_topics import to_profile
 from draws import some
 from pose_networks import MISSING, REASON
 
-ANGLES = graph.joint_states_topic("body1")
+ANGLES, DEVIATIONS = graph.joint_states_topic("body1"), graph.joint_states_stddev_topic("body1")
 SOON = 180.0
 """Seconds within which angles come, on a machine with much else to do; the first start compiles all that it imports."""
 
@@ -62,11 +63,13 @@ def test_a_rig_in_a_namespace_follows_changes_of_filter_and_convention_and_ends_
 
 @pytest.mark.skipif(bool(MISSING), reason=REASON)
 def test_colour_and_depth_cameras_have_a_launch_of_their_own(tools: Tools) -> None:
-    angles = tools.bench.collect(JointState, ANGLES)
+    angles, deviations = (tools.bench.collect(JointState, topic) for topic in (ANGLES, DEVIATIONS))
     bag = tools.share / "bags" / "camera_reaching"
     given = f"bag:={bag}", "driver:=plain", "compressed:=colour", "rate:=0.4"
     launch = tools.launch(*given, file="cameras.launch.py")
-    assert tools.bench.until(lambda: angles, SOON), launch.text()
+    assert tools.bench.until(lambda: len(angles) > 10 and len(deviations) > 10, SOON), launch.text()
+    known = [angle for angle in deviations[-1].position if np.isfinite(angle)]
+    assert len(known) > 5, deviations[-1]
     launch.interrupt()
     assert launch.ended() == 0, launch.text()
     assert "Traceback" not in launch.text() and "[ERROR]" not in launch.text()
