@@ -46,6 +46,9 @@ def _poses(bag: BagReader) -> Iterator[str]:
     for sensor, pose in sorted(poses.items()):
         x, y, z = pose.translation
         ahead = pose.rotation[:, 2]
+        if not pose.translation.any() and np.allclose(ahead, [1.0, 0.0, 0.0]):
+            yield f"{sensor}: the reference sensor; world begins at it, with x where it looks and z upwards"
+            continue
         left, down = np.round(np.degrees([np.arctan2(ahead[1], ahead[0]), np.arcsin(np.clip(-ahead[2], -1.0, 1.0))]))
         yield (
             f"{sensor}: at x {x:.2f}, y {y:.2f}, z {z:.2f} m of world, looks {abs(left):.0f} deg to the "

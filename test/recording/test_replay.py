@@ -359,7 +359,7 @@ def test_a_sensor_that_a_recording_lacks_is_refused_with_those_that_it_has(tmp_p
 
 def test_the_summary_of_a_replay_has_poses_and_known_angles(replayed_wave: Path, extended_wave: Path) -> None:
     lines = list(summary(replayed_wave))
-    assert lines[0].startswith("kinect1: at x 0.00, y 0.00, z 0.00 m of world, looks 0 deg")
+    assert lines[0].startswith("kinect1: the reference sensor; world begins at it")
     assert "looks 87 deg to the right of x" in lines[1] or "looks 88 deg to the right of x" in lines[1]
     assert [line.partition(":")[0] for line in lines[1:]] == [
         "kinect2",
