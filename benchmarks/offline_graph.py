@@ -11,7 +11,6 @@ from body_tracking.pipeline.offline import OfflineRunner
 from body_tracking.recording.forked import is_second
 from body_tracking.recording.replay import ReplaySettings
 from body_tracking.recording.rosbag2 import BAG_WIRE
-from body_tracking.systems import STAGES, stage_class
 
 
 class OfflineGraph:
@@ -29,11 +28,11 @@ class OfflineGraph:
     def __init__(
         self, settings: ReplaySettings, sink: Callable[[str, bytes, int], None], topics: Iterable[str]
     ) -> None:
-        values = settings.values()
-        self.stages = {name: stage_class(name)(values[name]) for name in STAGES if name in values}
+        hosted = settings.stages()
+        self.stages = {each.node: each.make() for each in hosted}
         self._sink = sink
-        upstream = [stage for name, stage in self.stages.items() if not is_second(name)]
-        downstream = [stage for name, stage in self.stages.items() if is_second(name)]
+        upstream = [self.stages[each.node] for each in hosted if not is_second(each.executable)]
+        downstream = [self.stages[each.node] for each in hosted if is_second(each.executable)]
         published = {*topics, *(port.topic for stage in upstream for port in stage.outputs)}
         self._upstream = OfflineRunner(upstream, BAG_WIRE, self._pass)
         self._downstream = OfflineRunner(downstream, BAG_WIRE, sink, published)

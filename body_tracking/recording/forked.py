@@ -45,18 +45,37 @@ class Written:
 
 
 @dataclass(frozen=True, slots=True)
+class StageSettings:
+    """A stage of the graph.
+
+    Attributes:
+        node: name of the node that would host it.
+        executable: of that node.
+        values: of all its parameters.
+    """
+
+    node: str
+    executable: str
+    values: Mapping[str, Value]
+
+    def make(self) -> Stage:
+        """The stage; BodyTrackingError for invalid parameters."""
+        return stage_class(self.executable)(self.values)
+
+
+@dataclass(frozen=True, slots=True)
 class Job:
     """Parameters of the second half, or of its last part.
 
     Attributes:
-        values: parameters of each stage, by its name.
+        stages: in the order in which messages go through them.
         out: the bag to write.
         topics: type and QoS of further topics to write.
         overwrite: replace an existing ``out``.
         model_covariance: also write the covariance of the filter's model.
     """
 
-    values: Mapping[str, Mapping[str, Value]]
+    stages: Sequence[StageSettings]
     out: Path
     topics: Mapping[str, tuple[str, Qos]]
     overwrite: bool
@@ -80,12 +99,12 @@ class Downstream:
     """
 
     def __init__(self, job: Job, follow: Callable[[Job], Last | ForkedDownstream] | None = None) -> None:
-        filters = [name for name in job.values if is_second(name) and not _is_last(name)]
-        self._stages = [stage_class(name)(job.values[name]) for name in filters]
+        filters = [each for each in job.stages if is_second(each.executable) and not _is_last(each.executable)]
+        self._stages = [each.make() for each in filters]
         self._runner = OfflineRunner(self._stages, BAG_WIRE, self._published, job.topics)
         own = {p.topic: (p.codec.type_name, p.qos) for p in self._runner.outputs if not p.optional}
-        rest = {name: values for name, values in job.values.items() if name not in filters}
-        self._next = (follow or Last)(replace(job, values=rest, topics={**job.topics, **own}))
+        rest = [each for each in job.stages if each not in filters]
+        self._next = (follow or Last)(replace(job, stages=rest, topics={**job.topics, **own}))
 
     def take(self, topic: str, cdr: bytes, at_ns: int) -> None:
         self._next.take(topic, cdr, at_ns)
@@ -116,7 +135,7 @@ class Last:
     """Runs the stages after the filter, and writes every message; errors as of :class:`Downstream`."""
 
     def __init__(self, job: Job) -> None:
-        self._stages = [stage_class(name)(values) for name, values in job.values.items() if _is_last(name)]
+        self._stages = [each.make() for each in job.stages if _is_last(each.executable)]
         self._runner = OfflineRunner(self._stages, BAG_WIRE, self._published, job.topics)
         self._covariance = job.model_covariance
         self._frames = 0

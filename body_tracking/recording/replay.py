@@ -30,7 +30,7 @@ from body_tracking.pipeline import graph
 from body_tracking.pipeline.offline import OfflineRunner
 from body_tracking.pipeline.people import SubjectSelector
 from body_tracking.pipeline.roles import ROLES
-from body_tracking.pipeline.system import Options
+from body_tracking.pipeline.system import NodeSpec, Options
 from body_tracking.recording import forked
 from body_tracking.recording.finding import advice_for
 from body_tracking.recording.progress import Progress
@@ -105,23 +105,28 @@ class ReplaySettings:
         """Whether the graph has sensors beside those of the option ``sensors``."""
         return bool(self.imus) or any(OPTIONS[name].source and bool(value) for name, value in self.more.items())
 
-    def values(self) -> dict[str, dict[str, Value]]:
-        """All parameters of each stage, by its name.
+    def stages(self) -> tuple[forked.StageSettings, ...]:
+        """The stages with all their parameters, in the order in which messages go through them.
 
         Raises:
             BodyTrackingError: inconsistent settings.
         """
-        specs = {spec.name: spec for spec in nodes_for(self.options())}
-        found: dict[str, dict[str, Value]] = {}
-        for name in (stage for stage in STAGES if stage in specs):
-            own, table = self.parameters.get(name, {}), stage_class(name).PARAMETERS
-            given = {**specs[name].defaults, **OFFLINE, **specs[name].parameters, "reference": self.reference, **own}
+        found = []
+        for spec in _hosts(self.options()):
+            own, table = self.parameters.get(spec.name, {}), stage_class(spec.executable).PARAMETERS
+            given = {**spec.defaults, **OFFLINE, **spec.parameters, "reference": self.reference, **own}
             known = {item.name for item in table}
-            checked = check_all(table, {key: value for key, value in given.items() if key in known})
-            found[name] = {**own, **checked}
-        if self.smooth and "skeleton_filter" in found:
-            found["skeleton_filter"]["lag"] = WHOLE_LAG
-        return found
+            values = {**own, **check_all(table, {key: value for key, value in given.items() if key in known})}
+            if self.smooth and spec.executable == "skeleton_filter":
+                values["lag"] = WHOLE_LAG
+            found.append(forked.StageSettings(spec.name, spec.executable, values))
+        return tuple(found)
+
+
+def _hosts(options: Options) -> list[NodeSpec]:
+    """The nodes that host a stage, in the order in which messages go through them."""
+    hosts = (spec for spec in nodes_for(options) if spec.executable in STAGES)
+    return sorted(hosts, key=lambda spec: STAGES.index(spec.executable))
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,13 +240,13 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
         passed = {topic: (bag.topics[topic].type_name, bag.topics[topic].qos) for topic in kept}
         if settings.calibration_file is not None:
             load(settings.calibration_file)  # raises if it is missing or invalid
-        values = settings.values()
+        all_stages = settings.stages()
         # the stages may raise: construct them before `out` is replaced
-        stages = [stage_class(name)(each) for name, each in values.items() if not forked.is_second(name)]
+        stages = [each.make() for each in all_stages if not forked.is_second(each.executable)]
         written_by_us = {
             p.topic: (p.codec.type_name, p.qos) for stage in stages for p in stage.outputs if not p.optional
         }
-        job = forked.Job(values, out, {**passed, **written_by_us}, overwrite, settings.model_covariance)
+        job = forked.Job(all_stages, out, {**passed, **written_by_us}, overwrite, settings.model_covariance)
         downstream = forked.start_downstream(job)
         try:
             runner = OfflineRunner(stages, BAG_WIRE, downstream.take)
@@ -276,7 +281,7 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
             raise ReplayError(f"{bag_path}: no frame of {given} came through ({said})")
         return ReplayReport(
             written.frames,
-            str(values["skeleton_filter"]["filter"]) if "skeleton_filter" in values else "",
+            next((str(each.values["filter"]) for each in all_stages if each.executable == "skeleton_filter"), ""),
             tuple(recorded_filters),
             (bag.end_ns - bag.start_ns) / NANOSECONDS,
             time.perf_counter() - began,
@@ -323,7 +328,7 @@ _NAMED: Final = ("sensors", "filter", "convention", "calibration", "imus", "para
 def settings_from(args: argparse.Namespace) -> ReplaySettings:
     """The settings of a command line."""
     options: dict[str, Any] = {**with_file(options_of(**{**options_from(args), "external": True}), args.params_file)}
-    specs = [spec for spec in nodes_for(options) if spec.name in STAGES]
+    specs = _hosts(options)
     left = ("use_sim_time", "sensors", "calibration_file", *OFFLINE)
     parameters = {
         node: {name: value for name, value in values.items() if name not in left}

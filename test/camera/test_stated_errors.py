@@ -21,7 +21,6 @@ from body_tracking.recording.replay import ReplaySettings
 from body_tracking.recording.rosbag2 import BAG_WIRE, deserialize
 from body_tracking.simulation.layouts import layout
 from body_tracking.simulation.scene import Setup, SimulatedRecording, simulate
-from body_tracking.systems import STAGES, stage_class
 
 ACROSS, ALONG = 0.043, 0.03
 """Metres: standard deviations across the line of sight, as published for a network, and along it."""
@@ -59,8 +58,7 @@ def played(recording: SimulatedRecording, seed: int, filter_parameters: dict[str
     frames = sorted(cameras(recording, np.random.default_rng(seed)), key=lambda frame: frame.received_ns)
     names = tuple(sorted(sensor.pose.sensor for sensor in recording.sensors))
     given = {"skeleton_filter": {"not_kinects": names, **filter_parameters}, "joint_angles": {"convention": "isb"}}
-    values = ReplaySettings(names, parameters=given).values()
-    stages = [stage_class(name)(values[name]) for name in STAGES if name in values]
+    stages = [each.make() for each in ReplaySettings(names, parameters=given).stages()]
     whole = OfflineRunner(stages, BAG_WIRE, take)
     whole.start(frames[0].received_ns)
     for frame in frames:

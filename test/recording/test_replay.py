@@ -50,6 +50,7 @@ from body_tracking.simulation.scene import Setup, simulate
 from draws import some
 from excerpts import beginning
 from patience import PATIENCE
+from pose_networks import MISSING, REASON
 
 ROOT = Path(__file__).resolve().parents[2]
 BAG = ROOT / "bags" / "tpose_wave"
@@ -158,7 +159,7 @@ def test_the_other_process_does_not_collect_inherited_garbage(tmp_path: Path, mo
 
 def job(out: Path, **settings: str) -> forked.Job:
     chosen = ReplaySettings(("kinect1",), **settings)  # type: ignore[arg-type]
-    return forked.Job(chosen.values(), out, {}, overwrite=False, model_covariance=False)
+    return forked.Job(chosen.stages(), out, {}, overwrite=False, model_covariance=False)
 
 
 def test_the_end_of_the_other_process_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -307,7 +308,8 @@ def test_smoothing_loses_no_frame_and_trembles_less(
 
 
 def test_only_a_replay_smooths_by_more_than_a_live_graph(wave: Path, tmp_path: Path, command: Command) -> None:
-    assert ReplaySettings(smooth=True).values()["skeleton_filter"]["lag"] > MAX_LAG
+    (lag,) = (each.values["lag"] for each in ReplaySettings(smooth=True).stages() if each.node == "skeleton_filter")
+    assert lag > MAX_LAG
     code, _, error = command("replay", wave, "-o", tmp_path / "out", "--lag", MAX_LAG + 0.1)
     assert code == 2
     assert "lag" in error
@@ -355,6 +357,15 @@ def test_a_sensor_that_a_recording_lacks_is_refused_with_those_that_it_has(tmp_p
     driver = ("/imu_forearm_left/imu/data_raw", "/imu7/imu/data", "/imu7/imu/data_raw")
     with pytest.raises(graph.GraphError, match="are SEGMENT:imu7, forearm_left:imu_forearm_left"):
         graph.played_imu_topics(["hand_left"], driver)
+
+
+@pytest.mark.skipif(bool(MISSING), reason=REASON)
+def test_images_of_a_camera_become_angles(tmp_path: Path) -> None:
+    bag, out = beginning(BAG.with_name("camera_reaching"), tmp_path / "excerpt", 1.0), tmp_path / "out"
+    assert cli.main(["replay", str(bag), "-o", str(out), "--camera", "camera1", "--compressed", "colour"]) == 0
+    with BagReader(out) as reader:
+        counts = [reader.topics[topic].count for topic in (graph.skeleton_topic("camera1"), ANGLES)]
+    assert counts[0] >= 14 and counts[1] >= 10
 
 
 def test_the_summary_of_a_replay_has_poses_and_known_angles(replayed_wave: Path, extended_wave: Path) -> None:
