@@ -274,10 +274,10 @@ class InverseKinematics:
         """(...,) costs by normalised residuals (..., 19), values of the ranges (..., 26) and the tilt (..., 2)."""
         points = np.where(size <= HUBER, 0.5 * size**2, HUBER * (size - 0.5 * HUBER)).sum(axis=-1)
         off = (soft - self.prior.mean) / self.prior.stddev
-        leans = tilt / self.prior.tilt_stddev
+        tilts = tilt / self.prior.tilt_stddev
         over = self.ranges.excess_of(soft) / LIMIT_STDDEV
         twist = soft @ self.ranges.twist / _TWIST_STDDEV
-        result: FloatArray = points + 0.5 * ((off**2 + over**2).sum(axis=-1) + (leans**2).sum(axis=-1) + twist**2)
+        result: FloatArray = points + 0.5 * ((off**2 + over**2).sum(axis=-1) + (tilts**2).sum(axis=-1) + twist**2)
         return result
 
     def _normal_equations(

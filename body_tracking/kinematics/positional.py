@@ -6,9 +6,9 @@ between two vectors, and the angle between two vectors seen along a third (a dih
 ========================== ======================================================================== ============
 angle                      0, and what is positive                                                  range (deg)
 ========================== ======================================================================== ============
-trunk_flexion              upright; leaning forward                                                 -180 .. 180
-trunk_lateral_lean         upright; leaning to the person's right                                    -90 .. 90
-trunk_axial_lean           shoulder line above hip line; chest turned to the person's left          -180 .. 180
+trunk_flexion              upright; bent forwards                                                   -180 .. 180
+trunk_lateral_flexion      upright; bent to the person's right                                       -90 .. 90
+trunk_axial_rotation       shoulder line above hip line; chest turned to the person's left          -180 .. 180
 shoulder_elevation_*       upper arm along the trunk, downwards; raised                                0 .. 180
 shoulder_plane_*           abduction (arm raised sideways); +90 flexion (forwards), -90 extension   -180 .. 180
 humeral_rotation_*         bent forearm perpendicular to the plane of trunk axis and upper arm, in
@@ -17,10 +17,10 @@ elbow_flexion_*            straight; bent                                       
 clavicle_elevation_*       shoulder on the level of SpineShoulder along the trunk; raised            -90 .. 90
 ========================== ======================================================================== ============
 
-The trunk axis of the lean angles runs from SpineBase to SpineShoulder; its flexion and lateral lean are those of the
-Cardan sequence flexion, lateral, axial (ISB: Wu 2005, thorax), relative to the vertical and to the person's heading,
-the horizontal direction of the hip line: turning the whole person changes nothing. Signs are right-handed rotations
-about the person's left, forward and upward axes. Thorax axes for the arms: up from SpineMid to SpineShoulder; left
+The trunk axis runs from SpineBase to SpineShoulder; its flexion and lateral flexion are those of the Cardan sequence
+flexion, lateral, axial (ISB: Wu 2005, thorax), relative to the vertical and to the person's heading, the horizontal
+direction of the hip line: turning the whole person changes nothing. Signs are right-handed rotations about the person's
+left, forward and upward axes. Thorax axes for the arms: up from SpineMid to SpineShoulder; left
 along the shoulder line. Elevation, plane and humeral rotation are the three angles of the ISB's Y-X-Y sequence (Wu
 2005, glenohumeral): plane of elevation, elevation (there negative), axial rotation; internal rotation is positive.
 
@@ -60,8 +60,8 @@ from body_tracking.kinematics.motion import joint_densities
 
 ANGLE_NAMES: tuple[str, ...] = (
     "trunk_flexion",
-    "trunk_lateral_lean",
-    "trunk_axial_lean",
+    "trunk_lateral_flexion",
+    "trunk_axial_rotation",
     "shoulder_elevation_left",
     "shoulder_elevation_right",
     "shoulder_plane_left",
@@ -96,7 +96,7 @@ _N_VECTORS = len(_VECTORS)
 
 # (angle, vector a, vector b, sign of the angle between them, radians to add)
 _BETWEEN = (
-    ("trunk_lateral_lean", "trunk", "heading", 1.0, -np.pi / 2),
+    ("trunk_lateral_flexion", "trunk", "heading", 1.0, -np.pi / 2),
     ("shoulder_elevation_left", "upper_arm_left", "thorax", -1.0, np.pi),
     ("shoulder_elevation_right", "upper_arm_right", "thorax", -1.0, np.pi),
     ("elbow_flexion_left", "upper_arm_left", "forearm_left", 1.0, 0.0),
@@ -108,7 +108,7 @@ _BETWEEN = (
 # (angle, axis, sign of the axis, from vector, sign, to vector, quarter turns to add): from "from" to "to" about "axis"
 _DIHEDRAL = (
     ("trunk_flexion", "heading", 1.0, "vertical", 1.0, "trunk", 0),
-    ("trunk_axial_lean", "trunk", 1.0, "hips", 1.0, "shoulders", 0),
+    ("trunk_axial_rotation", "trunk", 1.0, "hips", 1.0, "shoulders", 0),
     ("shoulder_plane_left", "thorax", -1.0, "shoulders", 1.0, "upper_arm_left", 0),
     ("shoulder_plane_right", "thorax", 1.0, "shoulders", -1.0, "upper_arm_right", 0),
     ("humeral_rotation_left", "upper_arm_left", 1.0, "thorax", 1.0, "forearm_left", -1),
@@ -134,7 +134,7 @@ _ROWS = [row[0] for row in (*_BETWEEN, *_DIHEDRAL)]
 _ORDER: IntArray = np.array([_ROWS.index(name) for name in ANGLE_NAMES], dtype=np.intp)
 """Row of the two tables, one after the other, for each name; all below is in the order of the rows."""
 _N_BETWEEN, _N_ANGLES = len(_BETWEEN), len(ANGLE_NAMES)
-_TWIST: Final = _ROWS.index("trunk_axial_lean")
+_TWIST: Final = _ROWS.index("trunk_axial_rotation")
 _MOST_TWIST: Final = math.radians(70.0)
 """Largest twist of shoulders against hips: 50 degrees of the spine (``kinematics.ranges``), the rest of the clavicles.
 Where a sensor swaps left and right of one girdle it is larger for some frames; the excess is an error."""

@@ -6,8 +6,8 @@ rotation. At theta = 0, the T-pose, the angles turn about these axes of the base
 backward, z up):
 
 =========================  ===========================================================================================
-theta1, theta2, theta3     lower trunk about SpineBase: +z (turns left), +x (leans forward), +y (leans left)
-theta4, theta5, theta6     upper trunk about SpineMid: +y (leans left), +z (turns left), +x (leans forward)
+theta1, theta2, theta3     lower trunk about SpineBase: +z (turns left), +x (bends forwards), +y (bends to the left)
+theta4, theta5, theta6     upper trunk about SpineMid: +y (bends to the left), +z (turns left), +x (bends forwards)
 theta7, theta8, theta9     left clavicle about SpineShoulder: +y (goes down), +z (back), +x (turns about itself)
 theta10, theta11, theta12  right clavicle about SpineShoulder: +y (goes up), +z (forward), +x (turns about itself)
 theta13, theta14, theta15  left upper arm about ShoulderLeft: +y (goes down), +z (back), +x (turns about itself)

@@ -136,8 +136,8 @@ def test_the_trunk_is_a_cardan_sequence(flexion: float, lateral: float, axial: f
     positions[above] = turn.apply(positions[above] - UP) + UP
     angles = positional_angles(skeleton(positions))
     assert angle(angles, "trunk_flexion") == pytest.approx(flexion)
-    assert angle(angles, "trunk_lateral_lean") == pytest.approx(lateral)
-    assert angle(angles, "trunk_axial_lean") == pytest.approx(axial)
+    assert angle(angles, "trunk_lateral_flexion") == pytest.approx(lateral)
+    assert angle(angles, "trunk_axial_rotation") == pytest.approx(axial)
     assert both(angles, "shoulder_elevation") == pytest.approx((90.0, 90.0))
     assert both(angles, "shoulder_plane") == pytest.approx((0.0, 0.0), abs=1e-9)
 
@@ -165,7 +165,7 @@ def test_the_mirror_exchanges_left_and_right(seed: int) -> None:
     there = positional_angles(replace(skeleton(positions * [1, -1, 1], 0.01)).mirrored())
     for name, value, stddev in zip(here.names, there.position, there.position_stddev, strict=True):
         other = name.replace("left", "LEFT").replace("right", "left").replace("LEFT", "right")
-        sign = -1.0 if name in ("trunk_lateral_lean", "trunk_axial_lean") else 1.0
+        sign = -1.0 if name in ("trunk_lateral_flexion", "trunk_axial_rotation") else 1.0
         index = here.names.index(other)
         assert wrapped(sign * value - here.position[index]) == pytest.approx(0.0, abs=1e-9), name
         assert stddev == pytest.approx(here.position_stddev[index])
@@ -214,7 +214,7 @@ def test_a_twist_that_no_person_can_do_has_the_excess_as_an_error(twist: float) 
     upper = [joint for joint in Joint if body[joint, 2] > body[Joint.SPINE_MID, 2]]
     body[upper] = Rotation.from_euler("z", twist, degrees=True).apply(body[upper])
     found = positional_angles(skeleton(body, 0.01))
-    column = found.names.index("trunk_axial_lean")
+    column = found.names.index("trunk_axial_rotation")
     assert np.degrees(abs(found.position[column])) == pytest.approx(twist, abs=1.0)
     straight = positional_angles(skeleton(t_pose(), 0.01)).position_stddev[column]
     stated = np.degrees(np.hypot(straight, np.radians(max(twist - 70.0, 0.0))))

@@ -97,25 +97,28 @@ class OrientationUpdate:
             state = state.but(covariance=covariance, crosses=crosses, sources=sources)
 
         fade = math.exp(-since / _SLIP_TIME)
-        lean, leaning = fade * sources.lean[number], fade * fade * float(sources.leaning[number])
+        innovation_sum, sum_variance = (
+            fade * sources.innovation_sum[number],
+            fade * fade * float(sources.sum_variance[number]),
+        )
         corrected, white = self._turned_by(state, measurement, number, own)
         distance = float(white @ white)
         near = distance < self._gate
-        lean = lean + white * min(1.0, math.sqrt(self._gate / max(distance, 1e-9)))
-        leaning += 1.0
-        fits = near and float(lean @ lean) < _SLIPPED * leaning
+        innovation_sum = innovation_sum + white * min(1.0, math.sqrt(self._gate / max(distance, 1e-9)))
+        sum_variance += 1.0
+        fits = near and float(innovation_sum @ innovation_sum) < _SLIPPED * sum_variance
         passed = min(since, _SLIP_AFTER) if known else 0.0  # a new source has no earlier orientation
         unfit_for = 0.0 if fits else float(sources.unfit_for[number]) + passed
         if unfit_for > _SLIP_AFTER:
             self._counters["slips"] += 1
             state = state.but(covariance=slipped(state.covariance, own, p))
-            lean, leaning, unfit_for, near = np.zeros(3), 0.0, 0.0, True
+            innovation_sum, sum_variance, unfit_for, near = np.zeros(3), 0.0, 0.0, True
             corrected, _ = self._turned_by(state, measurement, number, own)
         if near:
             corrected = self._spun_by(corrected, measurement, number, own)
             state = corrected.but(oriented_ns=measurement.stamp_ns)
         self._counters["orientations_used" if near else "orientations_rejected"] += 1
-        looked_at = state.sources.looked_at(number, measurement, p, unfit_for, lean, leaning)
+        looked_at = state.sources.looked_at(number, measurement, p, unfit_for, innovation_sum, sum_variance)
         return self._priors.within(self._priors.bounded(state.but(sources=looked_at)))
 
     def _turned_by(

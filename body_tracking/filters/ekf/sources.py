@@ -113,8 +113,8 @@ class Sources:
         stated: (n, 2) rad2, variances of misalignment and heading by the last stated covariance.
         stamps: (n,) nanoseconds, of the last orientation that was compared with the state.
         unfit_for: (n,) seconds of inconsistent orientations without a break.
-        lean: (n, 3) faded sum of the normalised innovations.
-        leaning: (n,) variance of each component of ``lean`` for a consistent source.
+        innovation_sum: (n, 3) faded sum of the normalised innovations.
+        sum_variance: (n,) variance of each component of ``innovation_sum`` for a consistent source.
     """
 
     names: tuple[str, ...]
@@ -126,8 +126,8 @@ class Sources:
     stated: FloatArray
     stamps: NDArray[np.int64]
     unfit_for: FloatArray
-    lean: FloatArray
-    leaning: FloatArray
+    innovation_sum: FloatArray
+    sum_variance: FloatArray
 
     @classmethod
     def none(cls) -> Self:
@@ -184,8 +184,8 @@ class Sources:
             "stated": stated,
             "stamps": never,
             "unfit_for": 0.0,
-            "lean": np.zeros(3),
-            "leaning": 0.0,
+            "innovation_sum": np.zeros(3),
+            "sum_variance": 0.0,
         }
         grown = {name: np.append(getattr(self, name), [value], axis=0) for name, value in new.items()}
         return self._but(names=(*self.names, measurement.source), **grown), covariance
@@ -196,16 +196,16 @@ class Sources:
         measurement: SegmentOrientation,
         parameters: OrientationParameters,
         unfit_for: float,
-        lean: FloatArray,
-        leaning: float,
+        innovation_sum: FloatArray,
+        sum_variance: float,
     ) -> Self:
         """The sources after another orientation of one of them, used or rejected."""
         new = {
             "slow_variance": _slow_variance(measurement.covariance, parameters),
             "stamps": measurement.stamp_ns,
             "unfit_for": unfit_for,
-            "lean": lean,
-            "leaning": leaning,
+            "innovation_sum": innovation_sum,
+            "sum_variance": sum_variance,
         }
         changed = {name: getattr(self, name).copy() for name in new}
         for name, value in new.items():
