@@ -290,20 +290,24 @@ def test_other_mistakes_on_the_command_line(capsys: pytest.CaptureFixture[str], 
     assert "twice" in refusal(capsys, "--sensors", "a,a")
     file = tmp_path / "parameters.yaml"
     file.write_text("joint_angles: {ros__parameters: {convention: isb, input: model_state}}")
-    assert "has no model of the body" in refusal(capsys, "--filter", "lkf_zero_velocity", "--params-file", file)
+    assert "has no model of the body" in refusal(
+        capsys, "--external", "--filter", "lkf_zero_velocity", "--params-file", file
+    )
     file.write_text("skeleton_filter: {ros__parameters: {input: sensors}}")
     assert "cannot smooth" in refusal(capsys, "--external", "--filter", "thesis_lkf1", "--lag", "0.15")
     robot = BAGS.parent / "config" / "robots" / "iiwa7.yaml"
     assert "must not follow angles that come late" in refusal(capsys, "--robot", robot, "--lag", "0.15")
     assert "expected 0 to 0.3" in refusal(capsys, "--bag", BAG, "--lag", "0.5")
-    assert "takes fused skeletons" in refusal(capsys, "--filter", "lkf_zero_velocity", "--params-file", file)
+    assert "takes fused skeletons" in refusal(
+        capsys, "--external", "--filter", "lkf_zero_velocity", "--params-file", file
+    )
 
 
 # --- sensors that publish
 
 
 def test_up_without_arguments_takes_the_sensors_that_publish(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     monkeypatch.setenv("ROS_DOMAIN_ID", str(domain()))
@@ -319,6 +323,8 @@ def test_up_without_arguments_takes_the_sensors_that_publish(
 
     monkeypatch.setattr(discovery, "look", lambda namespace: discovery.Domain())
     assert "no sensor publishes in ROS domain" in refusal(capsys)
+    (tmp_path / "slow.yaml").write_text("skeleton_filter: {ros__parameters: {filter: ekf}}")
+    assert "no sensor publishes in ROS domain" in refusal(capsys, "--params-file", tmp_path / "slow.yaml")
 
 
 # --- parameters

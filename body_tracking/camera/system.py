@@ -76,9 +76,16 @@ def _finds_compressed(topics: Mapping[str, str]) -> dict[str, Value]:
     return {**found, "compressed": "colour"} if found else {}
 
 
-def _pictures(options: Options) -> dict[str, Value]:
-    """Defaults for the pictures on the viewer's page."""
-    return {"picture_rate": 5.0} if options["viewer"] else {}
+_MOST_PEOPLE = 6
+"""Largest value of the parameter ``people`` of the nodes here."""
+
+
+def _defaults(options: Options) -> dict[str, Value]:
+    """Pictures for the viewer's page, and as many people as the graph tracks."""
+    found: dict[str, Value] = {"picture_rate": 5.0} if options["viewer"] else {}
+    if options["subject"] == "all":
+        found["people"] = min(int(str(options["people"])) or _MOST_PEOPLE, _MOST_PEOPLE)
+    return found
 
 
 def _specs(options: Options) -> Iterable[NodeSpec]:
@@ -87,13 +94,13 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
         if options["compressed"] in ("colour", "both"):
             rig["compressed"] = True
         rig |= transport(options)
-        yield NodeSpec("camera_rig", "camera_rig", defaults=_pictures(options), parameters=rig)
+        yield NodeSpec("camera_rig", "camera_rig", defaults=_defaults(options), parameters=rig)
     own = asked(options, driver="driver", model="pose_model", compressed="compressed") | transport(options)
     for camera in _cameras(options):
         yield NodeSpec(
             f"{camera}_skeleton",
             "camera_skeleton",
-            defaults=_pictures(options),
+            defaults=_defaults(options),
             parameters={"camera": camera, **own},
         )
 
@@ -212,8 +219,9 @@ SYSTEM = System(
             COMPRESSED_IMAGE,
             RELIABLE,
             "camera_skeleton",
-            "the colour images of each camera of either node with the people drawn in, left blue and right orange, "
-            "JPEG; with the parameter `picture_rate`, which `--viewer` sets, and only while there is a subscriber",
+            "the colour images of a camera, or of each camera of `camera_rig`, with the people drawn in, left blue and "
+            "right orange, JPEG; with the parameter `picture_rate`, which `--viewer` sets, and only while there is a "
+            "subscriber",
         ),
     ),
     views=(

@@ -1,17 +1,19 @@
-"""``body_tracking show``: the joint angles in a recording as a table, and as a picture."""
+"""``body_tracking show``: the joint angles in a recording as a table, as a picture, and as numbers in a CSV file."""
 
 from __future__ import annotations
 
 import argparse
+import csv
+import io
 from pathlib import Path
 
 import numpy as np
 
-from body_tracking.core.skeleton import FloatArray
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.evaluation.metrics import angle_errors, wrapped
 from body_tracking.evaluation.pictures import ENOUGH, are_fine, draw
 from body_tracking.evaluation.reading import AngleSeries, EvaluationError, read, true_at
-from body_tracking.evaluation.report import Column, Table, make_folder
+from body_tracking.evaluation.report import Column, Table, make_folder, write
 
 
 def summary(angles: AngleSeries, truth: AngleSeries | None = None) -> Table:
@@ -76,6 +78,25 @@ def summarise(bag: Path, png: Path | None = None, body: str | None = None, truth
     return summary(tracked.angles, tracked.true_angles)
 
 
+def write_csv(angles: AngleSeries, file: Path) -> None:
+    """Write the angles with a row per frame: capture time, then each angle and its standard deviation in degrees.
+
+    The time is ROS time in seconds, to the nanosecond. Where an angle is unknown both cells are empty.
+
+    Raises:
+        EvaluationError: the file cannot be written.
+    """
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(["time", *(f"{name}{what}" for name in angles.names for what in ("", "_stddev"))])
+    known = np.isfinite(angles.known)
+    both = np.degrees(np.stack([angles.known, angles.stddev], axis=-1))
+    for stamp_ns, row, there in zip(angles.stamps_ns.tolist(), both, known, strict=True):
+        cells = ((f"{a:.3f}", f"{b:.3f}") if seen else ("", "") for (a, b), seen in zip(row, there, strict=True))
+        rows.writerow([f"{stamp_ns // NANOSECONDS}.{stamp_ns % NANOSECONDS:09d}", *(c for pair in cells for c in pair)])
+    write(file, text.getvalue().encode())
+
+
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """``body_tracking show``."""
     parser = subparsers.add_parser(
@@ -85,6 +106,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("bag", type=Path, help="a bag folder with joint angles, such as the output of replay")
     parser.add_argument("-o", "--output", type=Path, metavar="PNG", help="draw a picture into this file")
+    parser.add_argument(
+        "--csv", type=Path, metavar="FILE", help="write each frame's angles and standard deviations, in degrees"
+    )
     parser.add_argument("--body", metavar="ID", help="id of the person (default: the first in the recording)")
     parser.add_argument("--truth", type=Path, metavar="BAG", help="the bag with the truth (default: the same)")
     parser.set_defaults(run=run)
@@ -96,6 +120,9 @@ def run(args: argparse.Namespace) -> int:
     tracked = read(args.bag, args.body, args.truth)
     table = summary(tracked.angles, tracked.true_angles)
     print(f"{table.text()}\n{table.note}", flush=True)  # drawing takes seconds
+    if args.csv is not None:
+        write_csv(tracked.angles, args.csv)
+        print(f"\nangles: {args.csv}")
     if args.output is not None:
         make_folder(args.output)
         draw(tracked, args.output)

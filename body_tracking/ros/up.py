@@ -574,7 +574,9 @@ def flags(options: Mapping[str, Value]) -> Iterator[str]:
 def run(args: argparse.Namespace) -> int:
     """``body_tracking up``."""
     found: Mapping[str, Value] = {}
-    look_for = args.bag is None and args.params_file is None and not args.external
+    look_for = args.bag is None and not args.external
+    if args.params_file is not None:
+        look_for &= not has_sensors(args.params_file) and not names_sensors(_in_file(args.params_file))
     if look_for and not names_sensors(options_from(args)):
         options_for(args)  # raises before anything starts
         found = _sensors_there(names.check_namespace(args.namespace or "/"))

@@ -11,6 +11,7 @@ import pytest
 from camera_recording import BAG, NAMES, recording
 
 from body_tracking.camera.pose_model import PoseModel, PoseModelError
+from body_tracking.camera.settings import PEOPLE
 from body_tracking.camera.stage import CameraStage
 from body_tracking.camera.topics import COMPRESSED, COMPRESSED_DEPTH, people_topic
 from body_tracking.core.camera import Camera, CameraError
@@ -249,6 +250,16 @@ def test_each_camera_has_a_node_with_parameters_of_its_own(tmp_path: Path) -> No
     assert drivers == ["plain", "orbbec"]
     assert "depth_pose" not in found["camera1_skeleton"]
     assert all(found[f"{name}_skeleton"]["search_every"] == 1.0 for name in ("camera1", "camera2"))
+
+
+def test_cameras_look_for_as_many_people_as_the_graph_tracks() -> None:
+    def people(**options: Any) -> set[Any]:
+        given = options_of(camera=("camera1", "camera2"), **options)
+        return {spec.defaults.get("people") for spec in nodes_for(given) if spec.executable == "camera_skeleton"}
+
+    assert people() == {None} and people(people=3) == {None}
+    assert people(subject="all", people=3) == {3}
+    assert people(subject="all") == people(subject="all", people=16) == {PEOPLE.max}
 
 
 def test_missing_and_foreign_networks_are_named(tmp_path: Path) -> None:

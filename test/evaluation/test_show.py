@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from body_tracking.cli import main
 from body_tracking.core.message_types import JOINT_STATE, POINT_CLOUD
-from body_tracking.core.skeleton import N_JOINTS, FloatArray, Skeleton, TrackingState
+from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton, TrackingState
 from body_tracking.evaluation import pictures
 from body_tracking.evaluation.comparison import AngleComparison
 from body_tracking.evaluation.metrics import angle_errors
@@ -210,6 +211,24 @@ def test_a_bag_becomes_a_table_and_a_picture(
     assert elbow["rms_error"] < 1.2 * elbow["stddev"] and elbow["within_2_stddev"] > 90.0
     # straight in the T-pose, bent while waving
     assert 10.0 < table.row("humeral_rotation_left")["known"] < 80.0
+
+
+def test_the_angles_are_written_as_numbers(tracked_bag: Path, tmp_path: Path) -> None:
+    file, angles = tmp_path / "new" / "angles.csv", read(tracked_bag).angles
+    assert main(["show", str(tracked_bag), "--csv", str(file)]) == 0
+    with file.open(newline="", encoding="utf-8") as text:
+        rows = list(csv.DictReader(text))
+    assert len(rows) == len(angles.stamps_ns)
+    for number in (0, len(rows) // 2):
+        seconds, _, rest = rows[number]["time"].partition(".")
+        assert int(seconds) * NANOSECONDS + int(rest) == angles.stamps_ns[number]
+        for name, found, stddev in zip(angles.names, angles.known[number], angles.stddev[number], strict=True):
+            cells = rows[number][name], rows[number][f"{name}_stddev"]
+            if np.isnan(found):
+                assert cells == ("", "")
+            else:
+                assert [float(cell) for cell in cells] == pytest.approx(np.degrees([found, stddev]), abs=1e-3)
+    assert any(row["humeral_rotation_left"] == "" for row in rows)
 
 
 def test_a_bag_without_truth_or_skeletons_is_shown_all_the_same(tmp_path: Path) -> None:
