@@ -29,6 +29,8 @@ from body_tracking.recording.rosbag2 import BagReader, RawMessage, deserialize
 
 _PREFIX, _SUFFIX = "/humans/bodies/", "/joint_states"
 _MATCH_NS = NANOSECONDS // 50
+_RENAMED = {"trunk_lateral_lean": "trunk_lateral_flexion", "trunk_axial_lean": "trunk_axial_rotation"}
+"""Names in recordings of before 0.2.0."""
 _IN_EVERY_CONVENTION: Final = ("elbow_flexion_left", "elbow_flexion_right")
 """Positional angles that are the same in every convention that has their names. The trunk flexion of the others is
 against the pelvis, not the vertical; ISB's shoulder elevation has the other sign."""
@@ -288,6 +290,7 @@ def read_joint_states(bag: BagReader, topic: str, body: str) -> AngleSeries | No
     stamps = sorted(rows)
     position = np.array([rows[stamp] for stamp in stamps])
     short = tuple(name.removesuffix(f"_{body}") for name in names)
+    short = tuple(_RENAMED.get(name, name) for name in short)
     return AngleSeries(np.array(stamps, dtype=np.int64), short, position, np.zeros_like(position))
 
 
