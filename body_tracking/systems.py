@@ -254,7 +254,15 @@ def is_source(spec: NodeSpec) -> bool:
 
 
 def all_nodes_for(options: Options) -> tuple[NodeSpec, ...]:
-    """The nodes of a graph, and all that it could have: live, with a bag, and with all optional nodes."""
+    """The nodes of a graph, and all that it could have: live, with a bag, with all optional nodes, and with the sensors
+    of the default names, so that ``config/body_tracking.yaml`` holds for graphs of other sensors, too.
+    """
+    default = options_of(namespace=options["namespace"])
+    found = {spec.name: spec for given in (default, options) for spec in _possible_nodes(given)}
+    return tuple((found | {spec.name: spec for spec in nodes_for(options)}).values())
+
+
+def _possible_nodes(options: Options) -> Iterable[NodeSpec]:
     examples = {each.name: options[each.name] or each.example for each in OPTIONS.values() if each.example is not None}
     more: Options = {**options, **examples}
     # an option may replace nodes, too: so each is left out once
@@ -264,7 +272,7 @@ def all_nodes_for(options: Options) -> tuple[NodeSpec, ...]:
     for variant in fewer:
         with contextlib.suppress(graph.GraphError):  # another option may need this one
             found |= {spec.name: spec for spec in nodes_for(variant) if spec.name not in found}
-    return tuple((found | {spec.name: spec for spec in nodes_for(options)}).values())
+    return found.values()
 
 
 def stages_for(specs: Iterable[NodeSpec], parameters: Mapping[str, Mapping[str, Value]]) -> dict[str, Stage]:

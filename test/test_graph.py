@@ -295,6 +295,16 @@ def test_options_that_the_filter_does_not_support_are_refused(options: Options) 
         nodes_for(options)
 
 
+@pytest.mark.parametrize("given", [{"sensors": ("left", "right")}, {"sensors": ("kinect1",)}, {"camera": ("cam7",)}])
+def test_the_shipped_parameters_file_holds_for_other_sensors(given: dict[str, Any]) -> None:
+    pytest.importorskip("rclpy", reason="ROS is not installed")
+    options = options_of(**given)
+    specs = nodes_for(options)
+    assert parameters_for(specs, ROOT / "config" / "body_tracking.yaml", absent=all_nodes_for(options)).keys() == {
+        spec.name for spec in specs
+    }
+
+
 @pytest.mark.parametrize("options", VARIANTS)
 def test_names_are_unique_and_sources_come_last(options: Options) -> None:
     specs = nodes_for(options)
