@@ -275,6 +275,11 @@ def _possible_nodes(options: Options) -> Iterable[NodeSpec]:
     return found.values()
 
 
+def stage_hosts(specs: Iterable[NodeSpec]) -> list[NodeSpec]:
+    """The nodes that host a stage, in the order in which messages go through them."""
+    return sorted((spec for spec in specs if spec.executable in STAGES), key=lambda spec: STAGES.index(spec.executable))
+
+
 def stages_for(specs: Iterable[NodeSpec], parameters: Mapping[str, Mapping[str, Value]]) -> dict[str, Stage]:
     """The connected stages of a graph, by the names of their nodes, in the order of their places.
 
@@ -285,13 +290,10 @@ def stages_for(specs: Iterable[NodeSpec], parameters: Mapping[str, Mapping[str, 
     Raises:
         BodyTrackingError: invalid parameters of a node.
     """
-    hosts = sorted(
-        (spec for spec in specs if spec.executable in STAGES), key=lambda spec: STAGES.index(spec.executable)
-    )
     from body_tracking.pipeline.offline import connect  # numpy takes its time
 
     stages = {}
-    for spec in hosts:
+    for spec in stage_hosts(specs):
         own = {name: value for name, value in parameters[spec.name].items() if not is_ros_own(name)}
         stages[spec.name] = stage_class(spec.executable)(check_all(parameters_of(spec.executable), own))
     connect(tuple(stages.values()))

@@ -164,8 +164,8 @@ class PoseModel:
     """
 
     def __init__(self, folder: Path, threads: int = 1) -> None:
-        self._detector = _Network(folder / DETECTOR_FILE, threads, _DETECTOR_PIXELS, (0, 1))
-        self._landmarks = _Network(folder / LANDMARKS_FILE, threads, _LANDMARK_PIXELS, (0, 1, 3, 4))
+        self._detector = _Network(folder / DETECTOR_FILE, threads, _DETECTOR_PIXELS, 2)
+        self._landmarks = _Network(folder / LANDMARKS_FILE, threads, _LANDMARK_PIXELS, 5)
         self._anchors = _anchors()
 
     def detect(self, image: ImageArray, least: float = 0.5) -> list[Region]:
@@ -199,7 +199,7 @@ class PoseModel:
         to_image = region.to_image
         to_crop = cv2.invertAffineTransform(to_image) * _LANDMARK_PIXELS
         crop = cv2.warpAffine(image, to_crop, (_LANDMARK_PIXELS, _LANDMARK_PIXELS), flags=cv2.INTER_LINEAR)
-        found, presence, heat, world = self._landmarks(crop.astype(np.float32) / np.float32(255.0))
+        found, presence, _, heat, world = self._landmarks(crop.astype(np.float32) / np.float32(255.0))
         each = found.reshape(-1, 5).astype(np.float64)
         flat = _refined(each[:, :2] / _LANDMARK_PIXELS, heat[0])
         pixels = flat @ to_image[:, :2].T + to_image[:, 2]
@@ -255,9 +255,9 @@ def _in_heatmap(cells: IntArray) -> BoolArray:
 
 
 class _Network:
-    """A file of TensorFlow Lite: called with an image, returns its outputs of these numbers."""
+    """A file of TensorFlow Lite: called with an image, returns its outputs."""
 
-    def __init__(self, file: Path, threads: int, pixels: int, outputs: tuple[int, ...]) -> None:
+    def __init__(self, file: Path, threads: int, pixels: int, outputs: int) -> None:
         try:
             from ai_edge_litert.interpreter import Interpreter
         except ImportError as error:
@@ -271,13 +271,13 @@ class _Network:
             raise PoseModelError(f"{file}: {' '.join(str(error).split())}") from error
         (given,) = self._interpreter.get_input_details()
         found = self._interpreter.get_output_details()
-        if tuple(given["shape"]) != (1, pixels, pixels, 3) or len(found) <= max(outputs):
+        if tuple(given["shape"]) != (1, pixels, pixels, 3) or len(found) != outputs:
             raise PoseModelError(
                 f"{file}: a network from {tuple(given['shape'])} to {len(found)} arrays, expected "
-                f"{(1, pixels, pixels, 3)} and at least {1 + max(outputs)}"
+                f"{(1, pixels, pixels, 3)} and {outputs}"
             )
         self._input = given["index"]
-        self._outputs = [found[number]["index"] for number in outputs]
+        self._outputs = [each["index"] for each in found]
 
     def __call__(self, image: SingleArray) -> list[Any]:
         self._interpreter.set_tensor(self._input, image[None])

@@ -30,7 +30,7 @@ from body_tracking.recording.rosbag2 import BagReader, RawMessage, deserialize
 _PREFIX, _SUFFIX = "/humans/bodies/", "/joint_states"
 _MATCH_NS = NANOSECONDS // 50
 _RENAMED = {"trunk_lateral_lean": "trunk_lateral_flexion", "trunk_axial_lean": "trunk_axial_rotation"}
-"""Names in recordings of before 0.2.0."""
+"""Former names, which the shipped recordings have."""
 _IN_EVERY_CONVENTION: Final = ("elbow_flexion_left", "elbow_flexion_right")
 """Positional angles that are the same in every convention that has their names. The trunk flexion of the others is
 against the pelvis, not the vertical; ISB's shoulder elevation has the other sign."""

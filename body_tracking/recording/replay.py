@@ -30,7 +30,7 @@ from body_tracking.pipeline import graph
 from body_tracking.pipeline.offline import OfflineRunner
 from body_tracking.pipeline.people import SubjectSelector
 from body_tracking.pipeline.roles import ROLES
-from body_tracking.pipeline.system import NodeSpec, Options
+from body_tracking.pipeline.system import Options
 from body_tracking.recording import forked
 from body_tracking.recording.finding import advice_for
 from body_tracking.recording.progress import Progress
@@ -39,7 +39,6 @@ from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, check_new_bag, 
 from body_tracking.recording.summary import summary
 from body_tracking.systems import (
     OPTIONS,
-    STAGES,
     add_options,
     all_nodes_for,
     nodes_for,
@@ -47,6 +46,7 @@ from body_tracking.systems import (
     options_of,
     played,
     stage_class,
+    stage_hosts,
     with_file,
 )
 
@@ -112,7 +112,7 @@ class ReplaySettings:
             BodyTrackingError: inconsistent settings.
         """
         found = []
-        for spec in _hosts(self.options()):
+        for spec in stage_hosts(nodes_for(self.options())):
             own, table = self.parameters.get(spec.name, {}), stage_class(spec.executable).PARAMETERS
             given = {**spec.defaults, **OFFLINE, **spec.parameters, "reference": self.reference, **own}
             known = {item.name for item in table}
@@ -121,12 +121,6 @@ class ReplaySettings:
                 values["lag"] = WHOLE_LAG
             found.append(forked.StageSettings(spec.name, spec.executable, values))
         return tuple(found)
-
-
-def _hosts(options: Options) -> list[NodeSpec]:
-    """The nodes that host a stage, in the order in which messages go through them."""
-    hosts = (spec for spec in nodes_for(options) if spec.executable in STAGES)
-    return sorted(hosts, key=lambda spec: STAGES.index(spec.executable))
 
 
 @dataclass(frozen=True, slots=True)
@@ -328,7 +322,7 @@ _NAMED: Final = ("sensors", "filter", "convention", "calibration", "imus", "para
 def settings_from(args: argparse.Namespace) -> ReplaySettings:
     """The settings of a command line."""
     options: dict[str, Any] = {**with_file(options_of(**{**options_from(args), "external": True}), args.params_file)}
-    specs = _hosts(options)
+    specs = stage_hosts(nodes_for(options))
     left = ("use_sim_time", "sensors", "calibration_file", *OFFLINE)
     parameters = {
         node: {name: value for name, value in values.items() if name not in left}

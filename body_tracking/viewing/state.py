@@ -68,10 +68,10 @@ def _input(there: Mapping[str, NodeStatus], sensors: Sequence[str], start_page: 
     if (player := there.get(PLAYER)) is not None:
         bag = Path(player.values.get("bag", "")).name
         position, duration = player.number("position s") or 0.0, player.number("duration s") or 0.0
-        again = ", again and again" if player.values.get("loop") == "True" else ""
+        then = ", again and again" if player.values.get("loop") == "True" else ""
         if start_page and player.text == "at the end":
-            again = ": <i>time</i> plays it again from any place, <i>end</i> leads back to the list"
-        words = f"<b>{html.escape(bag)}</b>, {position:.1f} of {duration:.1f} s{again}"
+            then = ": <i>time</i> plays it again from any place, <i>end</i> leads back to the list"
+        words = f"<b>{html.escape(bag)}</b>, {position:.1f} of {duration:.1f} s{then}"
         colour = {"playing": GREEN, "paused": GREY, "at the end": GREY}.get(player.text, ORANGE)
         lines.append(line(colour, html.escape(player.text), words))
     rates: dict[str, float] = {} if PLAYER in there else dict.fromkeys(sensors, 0.0)
