@@ -72,7 +72,7 @@ def run(job: Job) -> Run:
         if skeleton is not None:
             own[number] = skeleton.positions
     compared = [number for number, frame in enumerate(frames) if frame.time >= _BEGIN]
-    body, view, kinect = stage.sensors[SENSOR].body, DepthCamera(scene.camera), kinect_skeletons(scene, truth)
+    body, view, kinect = stage.sensor.body, DepthCamera(scene.camera), kinect_skeletons(scene, truth)
     fitter = JatesiktatFitter(body)
     turned = orientations_at(measured, pose, stamps, body.model.joint_names)
     thetas: list[FloatArray] = []

@@ -132,7 +132,7 @@ def run_fast(job: Job) -> FastRun:
         errors.append(_off(skeleton, frame.joints))
         inferred.append(np.ones(6, np.bool_) if skeleton is None else skeleton.states[ARMS] != TrackingState.TRACKED)
         if number % _FLOOR == 0:
-            points = fit_from_truth(stage.sensors[SENSOR].body, view, depth, frame.person, frame.joints)
+            points = fit_from_truth(stage.sensor.body, view, depth, frame.person, frame.joints)
             floor.append(np.linalg.norm((points - frame.joints)[ARMS], axis=1))
     joints = np.array(truth)
     kinect = np.linalg.norm((kinect_skeletons(scene, joints) - joints)[:, ARMS], axis=2)
@@ -322,7 +322,7 @@ def run_walk(job: Job) -> WalkRun:
             continue
         if _off(skeleton, frame.joints).mean() < LOST:
             return WalkRun(frame.time - begin, True)
-    points = fit_from_truth(stage.sensors[SENSOR].body, view, depth, frame.person, frame.joints)
+    points = fit_from_truth(stage.sensor.body, view, depth, frame.person, frame.joints)
     floor = bool(np.linalg.norm((points - frame.joints)[ARMS], axis=1).mean() < LOST)
     return WalkRun(float("inf"), floor)
 
@@ -369,7 +369,7 @@ def run_trunk(job: Job) -> TrunkRun:
     images = [
         (stamp, depth_topic(SENSOR), (stamp, "", to_metres(f.image))) for stamp, f in zip(stamps, frames, strict=True)
     ]
-    mesh = {s: each for s, (each,) in fed(stage, pose, images, [], stage.sensors[SENSOR].skeleton_topic)}
+    mesh = {s: each for s, (each,) in fed(stage, pose, images, [], graph.skeleton_topic(stage.sensor.name))}
     read = kinect_skeletons(scene, np.array([*truth.values()]))
     states = np.where(np.isfinite(read[..., 0]), TrackingState.TRACKED, TrackingState.NOT_TRACKED).astype(np.uint8)
     kinect = {s: Skeleton(s, "", one, own, 0) for s, one, own in zip(stamps, read, states, strict=True)}
@@ -378,7 +378,7 @@ def run_trunk(job: Job) -> TrunkRun:
         "mesh": {s: each.positions for s, each in mesh.items()},
         "kinect": {s: each.positions for s, each in kinect.items()},
         "floor": {
-            s: fit_from_truth(stage.sensors[SENSOR].body, view, to_metres(f.image), f.person, f.joints)
+            s: fit_from_truth(stage.sensor.body, view, to_metres(f.image), f.person, f.joints)
             for s, f in [*zip(stamps, frames, strict=True)][::_FLOOR]
         },
     }

@@ -152,7 +152,7 @@ def run(job: Job) -> HiddenRun:
         given = orientations if segments else []
         skeletons = {
             stamp: skeleton
-            for stamp, (skeleton,) in fed(stage, pose, seen, given, stage.sensors[SENSOR].skeleton_topic)
+            for stamp, (skeleton,) in fed(stage, pose, seen, given, graph.skeleton_topic(stage.sensor.name))
         }
         tracks[name] = {stamp: (each.positions, each.covariances) for stamp, each in skeletons.items()}
         for behind in ("ekf", "ekf+sensor"):
@@ -170,7 +170,7 @@ def run(job: Job) -> HiddenRun:
                 for stamp, (each,) in filtered
             }
     persons = {stamp: frame.person for stamp, frame in zip(truth, frames, strict=True)}
-    body, view = stage.sensors[SENSOR].body, DepthCamera(scene.camera)
+    body, view = stage.sensor.body, DepthCamera(scene.camera)
     turned = orientations_at(orientations, pose, [stamp for stamp, _ in chosen[::_FLOOR]], body.model.joint_names)
     tracks["floor"] = {}
     for stamp, side in chosen[::_FLOOR]:

@@ -58,7 +58,7 @@ def scene_of(motion: str, seed: int, speed: float = 1.0) -> DepthScene:
 
 def mesh_stage(scene: DepthScene, orientations: Sequence[str] = ()) -> MeshStage:
     """``mesh_tracker`` for the scene's camera, with the inertial sensors of these segments."""
-    values = {"depth": (SENSOR,), "orientations": tuple(orientations)}
+    values = {"camera": SENSOR, "orientations": tuple(orientations)}
     stage = MeshStage(check_all(MeshStage.PARAMETERS, values), lambda topic: False)
     list(stage.take(info_topic(SENSOR), scene.camera, Now(0, 0)))
     return stage
@@ -137,6 +137,6 @@ def kinect_skeletons(
 
 def skeleton_of(stage: MeshStage, outputs: Iterable[Any]) -> Skeleton | None:
     """The skeleton among the outputs for one image."""
-    topic = stage.sensors[SENSOR].skeleton_topic
+    topic = graph.skeleton_topic(stage.sensor.name)
     found = [output.payload[0] for output in outputs if output.topic == topic]
     return found[0] if found else None

@@ -72,6 +72,7 @@ BENCHMARKS = {
     "mesh_hidden": Benchmark(8, MAKEHUMAN),
     "mesh_hard": Benchmark(20, MAKEHUMAN),
     "mesh_baseline": Benchmark(6, MAKEHUMAN),
+    "mesh_live": Benchmark(4),
     "mesh_real": Benchmark(1, recordings("depth_turn")),
     "imu_pendulum": Benchmark(1, IMU),
     "imu_recordings": Benchmark(1, IMU),

@@ -1,4 +1,4 @@
-"""Stage of the node ``mesh_tracker``: from depth images to the skeleton and mesh of a person."""
+"""Stage of the node ``mesh_tracker``: from the depth images of a camera to the skeleton and mesh of a person."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from body_tracking.mesh.personalisation import DistinctPoses, PersonalisationErr
 from body_tracking.mesh.sensor_orientations import SensorOrientations
 from body_tracking.mesh.topics import (
     IMAGES,
-    PERSONALISE_SERVICE,
     body_index_topic,
     depth_topic,
     info_topic,
     mesh_sensor,
     mesh_topic,
+    personalise_service,
 )
 from body_tracking.mesh.tracking import MeshTracker, Tracked, TrackerParameters, prepare
 from body_tracking.messages.codecs import Orientation, SensorClock, Skeletons
@@ -41,7 +41,9 @@ from body_tracking.pipeline.shared import RELIABLE as TRANSPORT
 from body_tracking.pipeline.shared import names_in, skeleton_qos
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
 
-DEPTH = Parameter("depth", (), "depth cameras; the node takes /<sensor>/depth/image_raw and camera_info of each")
+CAMERA = Parameter(
+    "camera", "kinect1", "name of the depth camera; the node takes /<camera>/depth/image_raw and camera_info"
+)
 PERSON = Parameter(
     "person",
     "",
@@ -69,16 +71,16 @@ _ORIENTATIONS: Final = 32
 _CALIBRATIONS: Final = 1000
 """Queue of poses and clocks, long enough to lose none while an image is fitted."""
 _KEPT: Final = 64
-"""Queued images per camera with the parameter ``reliable``: two seconds, 60 MB at 512x424."""
+"""Queued images with the parameter ``reliable``: two seconds, 60 MB at 512x424."""
 _NO_INFO: Final = "images without camera_info"
 
 
 class MeshStage(Stage):
-    """Fits the mesh of a person to each image of depth cameras."""
+    """Fits the mesh of a person to each image of a depth camera."""
 
     NAME = "mesh_tracker"
     PARAMETERS = (
-        DEPTH,
+        CAMERA,
         PERSON,
         ORIENTATIONS,
         *parameters_from(TrackerParameters),
@@ -89,143 +91,113 @@ class MeshStage(Stage):
 
     def __init__(self, values: Mapping[str, Value], wanted: Callable[[str], bool] = lambda topic: True) -> None:
         super().__init__(values, wanted)
-        cameras = tuple(check_sensor_name(each) for each in names_in(values["depth"]))
-        if not cameras or len(set(cameras)) < len(cameras):
-            raise graph.GraphError(f"depth cameras: {', '.join(cameras) or 'none'}; expected one or more, each once")
-        self.sensors = {camera: DepthSensor(camera, values, self.events) for camera in cameras}
+        camera = check_sensor_name(str(values["camera"]))
+        self.sensor = DepthSensor(camera, values, self.events)
         segments = names_in(values["orientations"])
         self._orientations = SensorOrientations(segments)
-        self._counters: Counter[str] = Counter()
+        self._segments = {graph.orientation_topic(each): each for each in segments}
         prepare()
         reliable = bool(values["reliable"])
-        inputs, outputs = [], []
-        self._by_topic: dict[str, DepthSensor] = {}
-        self._bodies: dict[str, DepthSensor] = {}
-        for camera, sensor in self.sensors.items():
-            info, images, bodies = info_topic(camera), depth_topic(camera), body_index_topic(camera)
-            inputs.append(Port(info, DepthInfo(), LATCHED, foreign=True))
-            inputs += [
-                Port(
-                    *(topic, codec, IMAGES, _KEPT if reliable else 0),
-                    droppable=not reliable,
-                    perishable=not reliable,
-                    foreign=True,
-                )
-                for topic, codec in ((bodies, BodyIndex()), (images, DepthImage()))
-            ]
-            outputs += [
-                Port(sensor.skeleton_topic, Skeletons(), skeleton_qos(values), measured=True),
-                Port(sensor.mesh_topic, MeshMarker(), RELIABLE),
-            ]
-            self._by_topic |= dict.fromkeys((info, images, bodies), sensor)
-            self._bodies[bodies] = sensor
-        self._segments = {graph.orientation_topic(each): each for each in segments}
+        self._info, self._images, self._bodies = info_topic(camera), depth_topic(camera), body_index_topic(camera)
+        inputs = [Port(self._info, DepthInfo(), LATCHED, foreign=True)]
+        inputs += [
+            Port(
+                *(topic, codec, IMAGES, _KEPT if reliable else 0),
+                droppable=not reliable,
+                perishable=not reliable,
+                foreign=True,
+            )
+            for topic, codec in ((self._bodies, BodyIndex()), (self._images, DepthImage()))
+        ]
         if segments:
-            inputs += calibration_inputs(len(cameras), _CALIBRATIONS)
+            inputs += calibration_inputs(1, _CALIBRATIONS)
             qos = skeleton_qos(values)
             inputs += [Port(topic, Orientation(each), qos, _ORIENTATIONS) for topic, each in self._segments.items()]
-        self.inputs, self.outputs = tuple(inputs), tuple(outputs)
-        self.services = {PERSONALISE_SERVICE: self._personalise}
+        self._skeletons, self._meshes = graph.skeleton_topic(self.sensor.name), mesh_topic(camera)
+        self.inputs = tuple(inputs)
+        self.outputs = (
+            Port(self._skeletons, Skeletons(), skeleton_qos(values), measured=True),
+            Port(self._meshes, MeshMarker(), RELIABLE),
+        )
+        self.services = {personalise_service(camera): self._personalise}
 
     def take(self, topic: str, payload: Any, now: Now) -> Iterable[Output]:
         if topic in self._segments:
             self._orientations.add(payload)
-            return
-        if topic in (graph.CALIBRATION, graph.CALIBRATION_CLOCK):
+        elif topic in (graph.CALIBRATION, graph.CALIBRATION_CLOCK):
             self._place(payload)
-            return
-        sensor = self._by_topic[topic]
-        if isinstance(payload, Camera):
-            sensor.calibrate(payload)
-            return
-        stamp_ns, _, pixels = payload
-        if topic in self._bodies:
-            sensor.pairs.add_index(stamp_ns, pixels)
+        elif topic == self._info:
+            self.sensor.calibrate(payload)
         else:
-            sensor.pairs.add_depth(stamp_ns, pixels, now.steady_ns)
-        yield from self._of(sensor, now.steady_ns)
+            stamp_ns, _, pixels = payload
+            if topic == self._bodies:
+                self.sensor.pairs.add_index(stamp_ns, pixels)
+            else:
+                self.sensor.pairs.add_depth(stamp_ns, pixels, now.steady_ns)
+            yield from self.poll(now.steady_ns)
 
-    def poll(self, steady_ns: int) -> Iterable[Output]:
-        for sensor in self.sensors.values():
-            yield from self._of(sensor, steady_ns)
+    def poll(self, steady_ns: int) -> Iterator[Output]:
+        """The outputs of images that need not wait for a body index."""
+        while (pair := self.sensor.pairs.next(steady_ns)) is not None:
+            tracked = self.sensor.update(pair.stamp_ns, pair.depth, self._orientations, pair.bodies)
+            if tracked is not None:
+                yield from self._outputs(pair.stamp_ns, tracked)
 
     @property
     def deadline_ns(self) -> int | None:
-        waiting = [each.pairs.deadline_ns for each in self.sensors.values()]
-        return min((each for each in waiting if each is not None), default=None)
+        return self.sensor.pairs.deadline_ns
 
-    def _of(self, sensor: DepthSensor, steady_ns: int) -> Iterator[Output]:
-        """The outputs of images that need not wait for a body index."""
-        while (pair := sensor.pairs.next(steady_ns)) is not None:
-            tracked = sensor.update(pair.stamp_ns, pair.depth, self._orientations, pair.bodies)
-            if tracked is not None:
-                yield from self._outputs(sensor, pair.stamp_ns, tracked)
-
-    def _outputs(self, sensor: DepthSensor, stamp_ns: int, tracked: Tracked) -> Iterator[Output]:
-        frame_id = optical_frame(sensor.name)
-        yield Output(sensor.skeleton_topic, (tracked.skeleton(frame_id),), stamp_ns)
-        if self.wanted(sensor.mesh_topic) and sensor.mesh_is_due(stamp_ns):
+    def _outputs(self, stamp_ns: int, tracked: Tracked) -> Iterator[Output]:
+        frame_id = optical_frame(self.sensor.name)
+        yield Output(self._skeletons, (tracked.skeleton(frame_id),), stamp_ns)
+        if self.wanted(self._meshes) and self.sensor.mesh_is_due(stamp_ns):
             posed = tracked.fit.posed.vertices
-            yield Output(sensor.mesh_topic, (stamp_ns, frame_id, posed[sensor.body.model.faces]), stamp_ns)
+            yield Output(self._meshes, (stamp_ns, frame_id, posed[self.sensor.body.model.faces]), stamp_ns)
 
     def _place(self, payload: SensorPose | SensorClock) -> None:
         """Take a pose or clock of the calibration; ignores those of other sensors."""
-        for sensor in self.sensors.values():
-            if payload.sensor != sensor.name:
-                continue
-            if isinstance(payload, SensorPose):
-                sensor.placement.set_pose(payload)
-            else:
-                sensor.placement.set_clock(payload.valid_from_ns, payload.clock)
+        if payload.sensor != self.sensor.name:
+            return
+        if isinstance(payload, SensorPose):
+            self.sensor.placement.set_pose(payload)
+        else:
+            self.sensor.placement.set_clock(payload.valid_from_ns, payload.clock)
 
     def _personalise(self) -> str:
-        for sensor in self.sensors.values():
-            sensor.personalise_anew()
+        self.sensor.personalise_anew()
         return "move your arms and trunk before the camera: the shape of your body is estimated from different poses"
 
     def refused(self, topic: str) -> None:
         """Count a message of another encoding, or an unusable calibration."""
-        if topic in self._bodies:
-            self._bodies[topic].pairs.refuse()
+        if topic == self._bodies:
+            self.sensor.pairs.refuse()
             return
-        counters = self._by_topic[topic].counters if topic in self._by_topic else self._counters
-        counters["messages that cannot be used"] += 1
+        what = "" if topic in (self._info, self._images) else "inertial "
+        self.sensor.counters[f"{what}messages that cannot be used"] += 1
 
     def reset(self, topic: str) -> None:
         """Forget the person but not the body's shape, or the body-index images, or the orientations of one segment."""
-        if topic in self._bodies:
-            self._bodies[topic].pairs.forget_indices()
-        elif topic in self._by_topic:
-            self._by_topic[topic].reset()
+        if topic == self._bodies:
+            self.sensor.pairs.forget_indices()
         elif topic in self._segments:
             self._orientations.forget(self._segments[topic])
+        elif topic in (self._info, self._images):
+            self.sensor.reset()
 
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
-        """Warn of cameras without calibration, with images of another size or a covered lens, and of unusable
+        """Warn of a camera without calibration, with images of another size or a covered lens, and of unusable
         body-index images.
         """
-        problems = [
-            f"{name}: {problem}"
-            for name, sensor in self.sensors.items()
-            for problem in (sensor.problem, sensor.pairs.problem)
-            if problem
-        ]
-        values = {
-            f"{name} {key}": each for name, sensor in self.sensors.items() for key, each in sensor.state().items()
-        }
-        return (1 if problems else 0), "; ".join(problems), values
+        problems = [each for each in (self.sensor.problem, self.sensor.pairs.problem) if each]
+        return (1 if problems else 0), "; ".join(problems), self.sensor.state()
 
     def save(self) -> None:
         """Write the shape of the person's body if it is new."""
-        for sensor in self.sensors.values():
-            sensor.save()
+        self.sensor.save()
 
     @property
     def counters(self) -> Mapping[str, int]:
-        found = {
-            f"{name} {key}": each for name, sensor in self.sensors.items() for key, each in sensor.counters.items()
-        }
-        return {**found, **{f"inertial {key}": each for key, each in self._counters.items()}}
+        return self.sensor.counters
 
 
 class DepthSensor:
@@ -249,7 +221,6 @@ class DepthSensor:
 
     def __init__(self, camera: str, values: Mapping[str, Value], events: list[str]) -> None:
         self.name = mesh_sensor(camera)
-        self.skeleton_topic, self.mesh_topic = graph.skeleton_topic(self.name), mesh_topic(camera)
         self.problem = ""
         self.placement = Placement()
         self._camera, self._events = camera, events

@@ -8,12 +8,12 @@ from body_tracking.core.message_types import IMAGE, POINT_CLOUD
 from body_tracking.core.parameters import Value
 from body_tracking.core.qos import RELIABLE
 from body_tracking.mesh.topics import (
-    PERSONALISE_SERVICE,
     body_index_topic,
     depth_topic,
     info_topic,
     mesh_sensor,
     mesh_topic,
+    personalise_service,
 )
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.system import (
@@ -38,9 +38,14 @@ def _cameras(options: Options) -> tuple[str, ...]:
 
 
 def _specs(options: Options) -> Iterable[NodeSpec]:
-    if _cameras(options):
-        given = {"depth": _cameras(options), **asked(options, person="person"), **transport(options)}
-        yield NodeSpec("mesh_tracker", "mesh_tracker", defaults=_orientations(options), parameters=given)
+    own = asked(options, person="person") | transport(options)
+    for camera in _cameras(options):
+        yield NodeSpec(
+            mesh_sensor(camera),
+            "mesh_tracker",
+            defaults=_orientations(options),
+            parameters={"camera": camera, **own},
+        )
 
 
 def _orientations(options: Options) -> dict[str, Value]:
@@ -121,7 +126,7 @@ SYSTEM = System(
     ),
     services=(
         Service(
-            PERSONALISE_SERVICE,
+            personalise_service("<sensor>"),
             "mesh_tracker",
             "estimate the shape of the person's body anew from the next different poses",
         ),

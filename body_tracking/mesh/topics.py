@@ -12,8 +12,6 @@ IMAGES: Final = Qos(reliability="reliable", depth=10)
 MESH_SUFFIX: Final = "_mesh"
 """Suffix of the sensor name under which the tracker publishes skeletons."""
 
-PERSONALISE_SERVICE: Final = "mesh_tracker/personalise"
-
 _TURNED_BY: Final = {"upper_arm": "shoulder", "forearm": "elbow", "hand": "wrist"}
 JOINTS_OF: Final = {
     each: f"{side}_{_TURNED_BY[segment]}" for each in ARM_SEGMENTS for segment, _, side in [each.rpartition("_")]
@@ -44,3 +42,8 @@ def mesh_topic(sensor: str) -> str:
 def mesh_sensor(sensor: str) -> str:
     """Name of the sensor under which the skeletons of a depth camera's mesh are published."""
     return f"{sensor}{MESH_SUFFIX}"
+
+
+def personalise_service(sensor: str) -> str:
+    """The service that estimates the shape of the person before a depth camera anew."""
+    return f"{mesh_sensor(sensor)}/personalise"

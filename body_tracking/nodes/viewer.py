@@ -115,7 +115,9 @@ class ViewerNode(GraphNode):
         self.history = AngleHistory(given["window"])
         self.drawn, self.drawing_s = 0, 0.0
         self.ended = threading.Event()
-        self.triggers = {each.name: self.create_client(Trigger, each.name) for each in systems.SERVICES}
+        # the page has no buttons for those of single sensors
+        named = [each.name for each in systems.SERVICES if "<" not in each.name]
+        self.triggers = {name: self.create_client(Trigger, name) for name in named}
         self.setters = {
             name: self.create_client(SetParametersAtomically, f"{name}/set_parameters_atomically")
             for name in ("skeleton_filter", "joint_angles", "bag_player")

@@ -8,6 +8,7 @@ its modules and classes instead of importing them; the caller loads them.
 from __future__ import annotations
 
 import importlib
+import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -90,11 +91,19 @@ class TopicSpec:
 
 @dataclass(frozen=True, slots=True)
 class Service:
-    """A service of type ``std_srvs/srv/Trigger``: its name, the executable that offers it, its purpose."""
+    """A service of type ``std_srvs/srv/Trigger``: its name, the executable that offers it, its purpose.
+
+    In a name ``<sensor>`` stands for the name of any sensor.
+    """
 
     name: str
     executable: str
     text: str
+
+    def is_called(self, name: str) -> bool:
+        """Whether this is the service of a name, in whatever namespace."""
+        pattern = re.escape(self.name).replace(re.escape("<sensor>"), "[^/]+")
+        return re.fullmatch(f"(.*/)?{pattern}", name) is not None
 
 
 @dataclass(frozen=True, slots=True)

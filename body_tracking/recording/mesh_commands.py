@@ -59,8 +59,8 @@ def personalise(bag_path: Path, camera: str, out: Path) -> str:
         MeshCommandError: no depth images, or too few different poses.
         PersonFileError: the file cannot be written.
     """
-    stage = MeshStage(check_all(MeshStage.PARAMETERS, {"depth": (camera,)}), lambda topic: False)
-    sensor = stage.sensors[camera]
+    stage = MeshStage(check_all(MeshStage.PARAMETERS, {"camera": camera}), lambda topic: False)
+    sensor = stage.sensor
     runner = OfflineRunner((stage,), BAG_WIRE, lambda topic, cdr, at_ns: None)
     with RigReader(bag_path) as bag:
         progress = Progress(bag.start_ns, bag.end_ns)

@@ -236,7 +236,8 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
             load(settings.calibration_file)  # raises if it is missing or invalid
         all_stages = settings.stages()
         # the stages may raise: construct them before `out` is replaced
-        stages = [each.make() for each in all_stages if not forked.is_second(each.executable)]
+        first = {each.node: each.make() for each in all_stages if not forked.is_second(each.executable)}
+        stages = [*first.values()]
         written_by_us = {
             p.topic: (p.codec.type_name, p.qos) for stage in stages for p in stage.outputs if not p.optional
         }
@@ -264,11 +265,11 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
             raise
         progress.end()
         counters = Counter(runner.counters)
-        for stage in stages:
-            counters.update({f"{stage.NAME} {name}": count for name, count in stage.counters.items()})
+        for node, stage in first.items():
+            counters.update({f"{node} {name}": count for name, count in stage.counters.items()})
         counters |= Counter(written.counters)  # both halves may have counted the same message
-        states = [stage.state(bag.end_ns) for stage in stages]
-        problems = [text for level, text, _ in states if level and text]
+        states = {node: stage.state(bag.end_ns) for node, stage in first.items()}
+        problems = [f"{node}: {text}" for node, (level, text, _) in states.items() if level and text]
         if not written.frames:
             given = ", ".join(settings.sensors or sources)
             said = "; ".join(problems) or _listed(+counters)

@@ -59,7 +59,7 @@ def _list(found: list[str], namespace: str) -> None:
         )
     width = max(map(len, found))
     for name in found:
-        text = next((each.text for each in SERVICES if f"/{name}".endswith(f"/{each.name}")), "of another package")
+        text = next((each.text for each in SERVICES if each.is_called(name)), "of another package")
         print(f"{name:<{width}}  {text}")
 
 

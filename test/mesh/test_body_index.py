@@ -193,7 +193,7 @@ def two_people(number: int, x: float, distance: float) -> tuple[SingleArray, Ind
 
 
 def calibrated() -> MeshStage:
-    node = MeshStage(check_all(MeshStage.PARAMETERS, {"depth": ("kinect1",)}), lambda topic: False)
+    node = MeshStage(check_all(MeshStage.PARAMETERS, {"camera": "kinect1"}), lambda topic: False)
     assert not [*node.take(INFO, recording().camera, Now(0, 0))]
     return node
 
@@ -246,7 +246,7 @@ def test_bad_body_index_images_are_counted_and_named_and_the_image_is_used_witho
     node = calibrated()
     depth, index = recording().images[STAMPS[0]], np.full(recording().images[STAMPS[0]].shape, NO_BODY, np.uint8)
     assert error(node, 0, depth, index[::2, ::2].copy()) < 0.05
-    assert node.counters["kinect1 body-index images of another size"] == 1
+    assert node.counters["body-index images of another size"] == 1
     level, text, _ = node.state(0)
     assert level == 1 and f"{BODIES}: 128 x 106 pixels, the depth image has 256 x 212" in text
     message = array_to_image(depth, STAMPS[1], "camera", BAG_MESSAGES, "32FC1")
@@ -254,7 +254,7 @@ def test_bad_body_index_images_are_counted_and_named_and_the_image_is_used_witho
         BodyIndex().decode(BAG_WIRE.serialize(IMAGE, message), BAG_WIRE)
     node.refused(BODIES)
     assert error(node, 1, depth, None) < 0.05
-    assert node.counters["kinect1 body-index images of another encoding"] == 1 and "not mono8" in node.state(0)[1]
+    assert node.counters["body-index images of another encoding"] == 1 and "not mono8" in node.state(0)[1]
     # nobody, by one that is right
     assert np.isnan(error(node, 2, depth, index)) and node.state(0)[:2] == (0, "")
     assert np.isnan(error(node, 3, np.zeros_like(depth), index)) and COVERED in node.state(0)[1]
@@ -281,7 +281,7 @@ def test_a_bag_with_body_index_images_is_replayed_with_them(tmp_path: Path) -> N
             bag.write(IMAGES, DepthImage().encode((stamp, "camera", millimetres), BAG_WIRE), stamp)
             bag.write(BODIES, BodyIndex().encode((stamp, "camera", index), BAG_WIRE), stamp + MS)
     report = replay(bag_path, out, ReplaySettings((), more={"depth": ("kinect1",)}))
-    assert report.counters["mesh_tracker kinect1 images with a body index"] == COUNT - 1
+    assert report.counters["kinect1_mesh images with a body index"] == COUNT - 1
     with BagReader(out) as written:
         assert written.topics[BODIES].type_name == IMAGE
         for raw in written.messages([SKELETONS]):

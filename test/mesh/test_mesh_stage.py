@@ -17,6 +17,7 @@ from body_tracking.core.orientation import OrientationError, SegmentOrientation
 from body_tracking.core.parameters import check_all
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import NANOSECONDS, Joint, SingleArray
+from body_tracking.core.sources import SensorNameError
 from body_tracking.mesh import body_model, storage
 from body_tracking.mesh.codecs import DepthImage, MeshMarker
 from body_tracking.mesh.depth import DepthError
@@ -38,7 +39,7 @@ NOW = Now(0, 0)
 
 
 def made(wanted: bool = False, **given: Any) -> MeshStage:
-    return MeshStage(check_all(MeshStage.PARAMETERS, {"depth": ("kinect1",), **given}), lambda topic: wanted)
+    return MeshStage(check_all(MeshStage.PARAMETERS, {"camera": "kinect1", **given}), lambda topic: wanted)
 
 
 def take(node: MeshStage, number: int, depth: SingleArray | None = None) -> list[Output]:
@@ -59,13 +60,13 @@ def test_a_skeleton_with_covariance_has_the_stamp_of_its_image() -> None:
     assert output.topic == SKELETONS and output.stamp_ns == skeleton.stamp_ns == STAMPS[0]
     assert skeleton.frame_id == "kinect1_mesh_optical_frame"
     assert np.linalg.eigvalsh(skeleton.covariances).min() > 0.0
-    assert node.state(0)[0] == 0 and node.counters["kinect1 images"] == 1
+    assert node.state(0)[0] == 0 and node.counters["images"] == 1
 
 
 def test_images_without_camera_info_are_counted_and_named() -> None:
     node = made()
     assert take(node, 0) == []
-    assert node.counters["kinect1 images without camera_info"] == 1
+    assert node.counters["images without camera_info"] == 1
     level, text, _ = node.state(0)
     assert level == 1 and INFO in text
     node = calibrated()
@@ -78,17 +79,17 @@ def test_an_image_of_another_size_in_mid_run_is_refused_until_the_calibration_fo
     half = recording().images[STAMPS[1]][::2, ::2]
     with pytest.raises(DepthError, match="128 x 106"):
         take(node, 1, half)
-    assert node.counters["kinect1 images of another size"] == 1 and node.state(0)[0] == 1
+    assert node.counters["images of another size"] == 1 and node.state(0)[0] == 1
     assert take(node, 2)  # it did no harm
     own = recording().camera
     matrix = np.diag([0.5, 0.5, 1.0]) @ own.matrix
     [*node.take(INFO, replace(own, width=128, height=106, matrix=matrix), NOW)]
     assert take(node, 3, np.ascontiguousarray(recording().images[STAMPS[3]][::2, ::2]))
     # a driver sends its calibration with each image
-    searches = node.counters["kinect1 searches"]
+    searches = node.counters["searches"]
     [*node.take(INFO, replace(own, width=128, height=106, matrix=matrix.copy()), NOW)]
     assert take(node, 4, np.ascontiguousarray(recording().images[STAMPS[4]][::2, ::2]))
-    assert node.counters["kinect1 searches"] == searches
+    assert node.counters["searches"] == searches
 
 
 def test_other_encodings_are_refused_and_counted() -> None:
@@ -97,7 +98,7 @@ def test_other_encodings_are_refused_and_counted() -> None:
     with pytest.raises(MessageError, match="mono8"):
         DepthImage().decode(BAG_WIRE.serialize("sensor_msgs/msg/Image", message), BAG_WIRE)
     node.refused(IMAGES)
-    assert node.counters["kinect1 messages that cannot be used"] == 1
+    assert node.counters["messages that cannot be used"] == 1
 
 
 @pytest.mark.parametrize("covering", [0.0, np.nan])
@@ -130,14 +131,14 @@ def test_the_shape_is_estimated_from_different_poses_and_kept_in_a_file(tmp_path
     file = tmp_path / "person.yaml"
     node = calibrated(person=str(file), personalise_from=2)
     for number in (0, 1, 106):  # the arms hang, and are stretched forward
-        node.sensors["kinect1"].reset()
-        assert not node.counters.get("kinect1 personalisations")
+        node.sensor.reset()
+        assert not node.counters.get("personalisations")
         take(node, number)
-    assert node.counters["kinect1 personalisations"] == 1 and "body of 1." in node.events[-1]
+    assert node.counters["personalisations"] == 1 and "body of 1." in node.events[-1]
     node.save()
     again = made(person=str(file))
-    np.testing.assert_allclose(again.sensors["kinect1"].body.shape, node.sensors["kinect1"].body.shape, atol=1e-6)
-    assert "poses" in node.services["mesh_tracker/personalise"]()
+    np.testing.assert_allclose(again.sensor.body.shape, node.sensor.body.shape, atol=1e-6)
+    assert "poses" in node.services["kinect1_mesh/personalise"]()
     for content in ("shape: [1]", "shape: {}", "- 1", "{shape: [0,0,0,0,0,0,0,0,0,0], covariance: [[1]]}"):
         file.write_text(content)
         with pytest.raises(storage.PersonFileError, match=str(file)):
@@ -146,12 +147,12 @@ def test_the_shape_is_estimated_from_different_poses_and_kept_in_a_file(tmp_path
 
 def test_somebody_else_does_not_get_the_shape_of_who_has_left() -> None:
     node = calibrated()
-    sensor = node.sensors["kinect1"]
+    sensor = node.sensor
     take(node, 0)
     sensor._wear(body_model.load().body(np.full(10, 0.5)), 0.1 * np.eye(10))
     for number in range(1, 20):
         take(node, number, np.zeros_like(recording().images[STAMPS[0]]))
-    assert node.counters["kinect1 people lost"] == 1 and not sensor.body.shape.any()
+    assert node.counters["people lost"] == 1 and not sensor.body.shape.any()
 
 
 def test_the_mesh_is_published_where_a_subscriber_is_and_at_its_rate() -> None:
@@ -159,7 +160,7 @@ def test_the_mesh_is_published_where_a_subscriber_is_and_at_its_rate() -> None:
     meshes = [each for number in range(8) for each in take(node, number) if each.topic == mesh_topic("kinect1")]
     assert len(meshes) == 2  # 5 of 30 a second
     message = BAG_WIRE.deserialize("visualization_msgs/msg/Marker", MeshMarker().encode(meshes[0].payload, BAG_WIRE))
-    faces = node.sensors["kinect1"].body.model.faces
+    faces = node.sensor.body.model.faces
     assert message.type == 11 and len(message.points) == faces.size
     points = np.array([[p.x, p.y, p.z] for p in message.points])
     assert np.abs(points.mean(axis=0) - recording().joints[STAMPS[0]].mean(axis=0)).max() < 0.5
@@ -169,18 +170,17 @@ def test_time_that_jumped_back_forgets_the_person() -> None:
     node = calibrated()
     take(node, 1)
     node.reset(IMAGES)
-    assert take(node, 0) and node.counters["kinect1 searches"] == 2
+    assert take(node, 0) and node.counters["searches"] == 2
 
 
-@pytest.mark.parametrize("cameras", [(), ("kinect1", "kinect1")])
-def test_cameras_are_named_each_once(cameras: tuple[str, ...]) -> None:
-    with pytest.raises(graph.GraphError, match="depth cameras"):
-        made(depth=cameras)
+def test_a_camera_without_a_name_is_refused() -> None:
+    with pytest.raises(SensorNameError, match="sensor"):
+        made(camera="")
 
 
 def test_a_depth_camera_is_a_sensor_of_the_graph_that_its_mesh_tracker_computes() -> None:
     alone = {spec.name: spec for spec in nodes_for(options_of(depth=("kinect1",)))}
-    assert "mesh_tracker" in alone and not any("_skeleton" in name for name in alone)
+    assert alone["kinect1_mesh"].executable == "mesh_tracker" and not any("_skeleton" in name for name in alone)
     assert alone["fusion"].parameters["sensors"] == ("kinect1_mesh",)
     both = {spec.name: spec for spec in nodes_for(options_of(depth=("kinect1",), sensors=("kinect2",)))}
     for specs in (alone, both):
@@ -210,7 +210,7 @@ def turned(stamp_ns: int, quat_xyzw: np.ndarray, rate: np.ndarray | None = None)
 
 def test_an_orientation_comes_to_the_fit_in_the_cameras_frame_at_the_images_time() -> None:
     worn = SensorOrientations(("forearm_left",))
-    placement = calibrated().sensors["kinect1"].placement
+    placement = calibrated().sensor.placement
     placement.set_pose(CAMERA_POSE)
     placement.set_clock(0, ClockModel(offset_ns=-5 * NANOSECONDS))
     at_ns = 100 * NANOSECONDS
@@ -236,7 +236,7 @@ def test_orientations_wait_for_the_pose_of_the_camera_and_then_turn_a_hidden_for
     topic = graph.orientation_topic("forearm_left")
     assert {topic, graph.CALIBRATION, graph.CALIBRATION_CLOCK} < {port.topic for port in node.inputs}
     (first,) = take(node, 0)
-    assert node.counters["kinect1 images without the camera's pose for inertial sensors"] == 1
+    assert node.counters["images without the camera's pose for inertial sensors"] == 1
     [*node.take(graph.CALIBRATION, replace(CAMERA_POSE, sensor="kinect2"), NOW)]
     [*node.take(graph.CALIBRATION_CLOCK, SensorClock("kinect1_mesh", 0, ClockModel()), NOW)]
     [*node.take(graph.CALIBRATION, CAMERA_POSE, NOW)]
@@ -259,7 +259,7 @@ def test_orientations_wait_for_the_pose_of_the_camera_and_then_turn_a_hidden_for
     # a jump back of its time forgets the sensor
     node.reset(topic)
     take(node, 10)
-    assert node.counters["kinect1 images without an orientation of forearm_left"] == 1
+    assert node.counters["images without an orientation of forearm_left"] == 1
     node.refused(topic)
     assert node.counters["inertial messages that cannot be used"] == 1
 
@@ -272,7 +272,7 @@ def test_only_segments_that_the_mesh_turns_carry_sensors() -> None:
 def test_an_orientation_counts_once_in_the_mesh_or_in_the_filter() -> None:
     given: dict[str, Any] = {"imus": ("forearm_left:wrist", "pelvis"), "filter": "ekf"}
     specs = {spec.name: spec for spec in nodes_for(options_of(depth=("kinect1",), **given))}
-    assert specs["mesh_tracker"].defaults["orientations"] == ("forearm_left",)
+    assert specs["kinect1_mesh"].defaults["orientations"] == ("forearm_left",)
     assert specs["skeleton_filter"].defaults["orientations"] == ("pelvis",)
     (alone,) = [spec for spec in nodes_for(options_of(**given)) if spec.name == "skeleton_filter"]
     assert alone.defaults["orientations"] == ("forearm_left", "pelvis")

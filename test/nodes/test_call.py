@@ -33,7 +33,8 @@ class Rigs(Running):
         for name in (graph.START_SERVICE, f"lab/{graph.START_SERVICE}", "recorder/stop"):
             client = self.node.create_client(Trigger, f"/{name}")  # is kept, like those of the viewer
             assert client.wait_for_service(60.0), name
-        self.node.create_client(Trigger, "/mesh_tracker/personalise")
+        self.start("mesh_tracker", camera="side")
+        self.node.create_client(Trigger, f"/{graph.ALIGN_SERVICE}")
 
     def say(self, *words: str) -> tuple[int, str, str]:
         """Exit code, output and error output of ``body_tracking call``."""
@@ -53,12 +54,13 @@ def test_services_are_listed_with_what_they_do(rigs: Rigs) -> None:
         code, printed, error = rigs.say()
         listed = dict(line.split(maxsplit=1) for line in printed.splitlines())
         assert code == 0 and not error
-        if {"calibration/start", "lab/calibration/start", "recorder/stop"} <= listed.keys():
+        if {"calibration/start", "lab/calibration/start", "recorder/stop", "side_mesh/personalise"} <= listed.keys():
             break
     assert listed["calibration/start"].startswith("estimate the poses anew")
     assert listed["lab/calibration/start"] == listed["calibration/start"]
     assert listed["recorder/stop"] == "stop recording and close the bag"
-    assert "mesh_tracker/personalise" not in listed, "no node offers it"
+    assert graph.ALIGN_SERVICE not in listed, "no node offers it"
+    assert listed["side_mesh/personalise"].startswith("estimate the shape")
     for _ in range(5):
         code, printed, error = rigs.say("--namespace", "lab")
         names = [line.split()[0] for line in printed.splitlines()]

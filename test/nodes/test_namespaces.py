@@ -36,7 +36,6 @@ NEEDED: dict[str, dict[str, object]] = {
     "joint_angles": {"input": "model_state"},
     "robot_commands": {"mapping": ROOT / "config" / "robots" / "iiwa7.yaml"},
     "bag_player": {"bag": BAG},
-    "mesh_tracker": {"depth": "[kinect1]"},
     "camera_rig": {"setup": ROOT / "config" / "camera_rig"},
     "bag_recorder": {"start_recording": False},
     "viewer": {"port": 0},

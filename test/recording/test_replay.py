@@ -613,7 +613,7 @@ def test_inertial_sensors_without_a_pose_are_named(tmp_path: Path, command: Comm
     import_files([tmp_path / "a.csv"], tmp_path / "bag", sensors={tmp_path / "a.csv": "forearm_left"})
     words = ("replay", tmp_path / "bag", "-o", tmp_path / "out", "--sensors", "none", "--imus", "forearm_left")
     code, _, reported = command(*words)
-    assert code == 2 and reported.count("\n") == 1 and "(forearm_left: not aligned)" in reported
+    assert code == 2 and reported.count("\n") == 1 and "(imu_skeleton: forearm_left: not aligned)" in reported
     assert not (tmp_path / "out").exists()
 
 
