@@ -13,6 +13,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,9 @@ from body_tracking.core.qos import LATCHED
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.mesh.topics import IMAGES, depth_topic, info_topic, mesh_sensor
+from body_tracking.messages.codecs import Pose
 from body_tracking.pipeline import graph
-from body_tracking.recording.rosbag2 import BagReader, RawMessage
+from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, RawMessage
 from body_tracking.simulation.depth_bags import SHIPPED
 from body_tracking.systems import options_of
 
@@ -37,13 +39,13 @@ GROWTH = 1.5
 """Largest ratio of the last round's delay to that of the second."""
 
 
-def recorded() -> tuple[bytearray, list[RawMessage]]:
-    """The camera's calibration, and images and inertial readings in the order of their times."""
-    topics = [info_topic(RECORDED), depth_topic(RECORDED), *map(_imu_topic, FOREARMS)]
+def recorded() -> tuple[bytearray, SensorPose, list[RawMessage]]:
+    """The camera's calibration and pose, and images and inertial readings in the order of their times."""
     with BagReader(common.ROOT / "bags" / SHIPPED) as bag:
-        messages = [raw for raw in bag.messages() if raw.topic in topics]
-    (info,) = [raw.cdr for raw in messages if raw.topic == topics[0]]
-    return bytearray(info), [raw for raw in messages if raw.topic != topics[0]]
+        (info,) = [raw.cdr for raw in bag.messages([info_topic(RECORDED)])]
+        (pose,) = [Pose().decode(raw.cdr, BAG_WIRE) for raw in bag.messages([graph.TRUE_CALIBRATION])]
+        readings = list(bag.messages([depth_topic(RECORDED), *map(_imu_topic, FOREARMS)]))
+    return bytearray(info), pose, readings
 
 
 def _imu_topic(segment: str) -> str:
@@ -52,7 +54,7 @@ def _imu_topic(segment: str) -> str:
 
 def events(names: list[str], every: int, imus: tuple[str, ...]) -> Iterator[live.Event]:
     """One of ``every`` images to all cameras, and the readings of these sensors, round after round."""
-    info, messages = recorded()
+    info, _, messages = recorded()
     yield from ((0.0, info_topic(name), info) for name in names)
     start, end = messages[0].log_time_ns, messages[-1].log_time_ns
     length = (end - start) / NANOSECONDS + 1.0 / 30.0
@@ -82,7 +84,8 @@ def measured(cameras: int, every: int, imus: tuple[str, ...]) -> dict[str, Any]:
     bench.time("angles", angles)
     bench.hear_diagnostics()
     sensors = [mesh_sensor(name) for name in names]
-    poses = {name: SensorPose(name, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])) for name in sensors}
+    _, pose, _ = recorded()
+    poses = {name: replace(pose, sensor=name) for name in sensors}
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         calibration = live.calibrated(folder / "calibration.yaml", poses)
