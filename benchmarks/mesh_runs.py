@@ -18,7 +18,8 @@ from body_tracking.kinect.occlusion import Capsules
 from body_tracking.kinect.simulated_sensor import Misreading, SimulatedKinect
 from body_tracking.mesh.body_model import Body
 from body_tracking.mesh.depth import DepthCamera
-from body_tracking.mesh.solver import WIDE, JointPoints, MeshFitter, Orientation
+from body_tracking.mesh.energy import Observation
+from body_tracking.mesh.solver import WIDE, Fit, JointPoints, MeshFitter, Orientation
 from body_tracking.mesh.stage import MeshStage
 from body_tracking.mesh.topics import info_topic
 from body_tracking.mesh.tracking import observe_person
@@ -56,9 +57,9 @@ def scene_of(motion: str, seed: int, speed: float = 1.0) -> DepthScene:
     return DepthScene(held_out(people(), seed), motion, seed, speed=speed)
 
 
-def mesh_stage(scene: DepthScene, orientations: Sequence[str] = ()) -> MeshStage:
-    """``mesh_tracker`` for the scene's camera, with the inertial sensors of these segments."""
-    values = {"camera": SENSOR, "orientations": tuple(orientations)}
+def mesh_stage(scene: DepthScene, orientations: Sequence[str] = (), **given: Any) -> MeshStage:
+    """``mesh_tracker`` for the scene's camera, with the inertial sensors of these segments, and other parameters."""
+    values = {"camera": SENSOR, "orientations": tuple(orientations), **given}
     stage = MeshStage(check_all(MeshStage.PARAMETERS, values), lambda topic: False)
     list(stage.take(info_topic(SENSOR), scene.camera, Now(0, 0)))
     return stage
@@ -108,14 +109,26 @@ def fit_from_truth(
         joints: (25, 3) true joints in the optical frame, metres.
         orientations: of inertial sensors.
     """
+    seen, fit = fitted_from_truth(body, view, depth, person, joints, orientations)
+    return placed(MeshFitter(body), fit, seen, kinect_landmarks(body), np.eye(len(body.shape))).points
+
+
+def fitted_from_truth(
+    body: Body,
+    view: DepthCamera,
+    depth: SingleArray,
+    person: BoolArray,
+    joints: FloatArray,
+    orientations: Sequence[Orientation] = (),
+) -> tuple[Observation, Fit]:
+    """The points of :func:`fit_from_truth`, and their fit."""
     fitter = MeshFitter(body)
     seen = observe_person(view, depth, person, 600)
     own = np.array([body.model.index(name) for name in JOINTS])
     points = JointPoints(own, joints[ARMS], _STARTED)
     start = fitter.neutral(joints[Joint.SPINE_BASE])
     near = fitter.fit(seen, start, joints=points, orientations=orientations, scales=WIDE)
-    fit = fitter.fit(seen, near.pose, orientations=orientations)
-    return placed(fitter, fit, seen, kinect_landmarks(body), np.eye(len(body.shape))).points
+    return seen, fitter.fit(seen, near.pose, orientations=orientations)
 
 
 def kinect_skeletons(

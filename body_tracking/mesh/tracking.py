@@ -61,6 +61,8 @@ _LIMBS: Final = {
     side: [Joint[f"{name}_{side.upper()}"] for name in ("ELBOW", "WRIST", "HAND", "HAND_TIP", "THUMB")]
     for side in ("left", "right")
 }
+_OUTSIDE: Final = 0.1
+"""Share of seen vertices outside of the silhouette above which a start with a wide robust scale is tried."""
 _SEEN: Final = 0.05
 """Metres: largest standard deviation per axis of a tracked joint; others are inferred."""
 
@@ -153,6 +155,7 @@ class MeshTracker:
         self._lost_ns: int | None = None
         self._searched_ns: int | None = None
         self._arms_ns: int | None = None
+        self._wide_ns: int | None = None
         self._places: list[tuple[int, FloatArray]] = []
         self._choice = 0
         self.problem = NOBODY
@@ -246,7 +249,7 @@ class MeshTracker:
             prediction = self._predicted(stamp_ns, seen)
             fit = self._fitter.fit(seen, prediction.pose, prediction, orientations)
             if not fit.lost:
-                return self._with_arms(stamp_ns, seen, orientations, fit)
+                return self._or_better(stamp_ns, seen, orientations, fit)
             self.counters["second starts"] += 1
             fits = [fit, self._fitter.fit(seen, self._fits[-1][1].pose, None, orientations, points, WIDE)]
             course = self._course()
@@ -295,12 +298,13 @@ class MeshTracker:
         velocity = (last - first) / elapsed
         return velocity if _SLOWEST < np.hypot(velocity[0], velocity[2]) < _FASTEST else None
 
-    def _with_arms(self, stamp_ns: int, seen: Observation, orientations: Sequence[Orientation], fit: Fit) -> Fit:
-        """The fit, or a better one with the arms elsewhere.
+    def _or_better(self, stamp_ns: int, seen: Observation, orientations: Sequence[Orientation], fit: Fit) -> Fit:
+        """The fit, or a better one from another start.
 
         The trunk's surface can hold an arm that was hidden behind it for some images: a start with hanging arms frees
         it. A hand faster than predicted leaves unexplained points: starts with the hand there, and for a walking person
-        those of a search.
+        those of a search. A trunk that turned faster than predicted leaves vertices outside of the silhouette: a start
+        with a wide robust scale.
         """
         starts = [] if fit.matched >= _EXPLAINED else self._fitter.towards_unmatched(seen, fit)
         if starts:
@@ -310,6 +314,10 @@ class MeshTracker:
             self.counters["starts with hanging arms"] += 1
             starts = [*starts, self._fitter.with_hanging_arms(fit.pose)]
         fits = [self._fitter.fit(seen, start, None, orientations) for start in starts]
+        if fit.violations > _OUTSIDE and not self._waits(stamp_ns, self._wide_ns):
+            self._wide_ns = stamp_ns
+            self.counters["starts with a wide scale"] += 1
+            fits.append(self._fitter.fit(seen, self._fits[-1][1].pose, None, orientations, scales=WIDE))
         course = self._course()
         if fit.matched < _EXPLAINED and course is not None and self._may_search(stamp_ns):
             found = self._fitter.search(seen, orientations, course)
