@@ -18,8 +18,8 @@ from body_tracking.camera.codecs import CompressedColour
 from body_tracking.camera.topics import COMPRESSED, DRIVERS, RIG_SENSOR
 from body_tracking.core import so3
 from body_tracking.core.camera import Camera
-from body_tracking.core.message_types import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, POINT_CLOUD, TRANSFORM
-from body_tracking.core.qos import LATCHED, RELIABLE, SENSOR_DATA
+from body_tracking.core.message_types import COMPRESSED_IMAGE, IMAGE
+from body_tracking.core.qos import LATCHED
 from body_tracking.core.sensor_poses import SensorPose, level_pose
 from body_tracking.core.sources import optical_frame
 from body_tracking.markers import setup
@@ -33,7 +33,7 @@ from body_tracking.pipeline import graph
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, BagWriter, serialize
 from body_tracking.simulation.colour_images import CAMERA, Painter, colour_camera
-from body_tracking.simulation.depth_bags import capture_times, truth_messages
+from body_tracking.simulation.depth_bags import TRUTH, capture_times, truth_messages
 from body_tracking.simulation.depth_scene import RATE, DepthFrame, DepthScene, held_out
 from body_tracking.simulation.makehuman import makehuman_for
 from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS, WORLD
@@ -56,11 +56,6 @@ _WIDTH: Final = 480
 """Width of a colour image, pixels; a depth image has half of it."""
 _PAIR_FROM: Final = 2.0
 """Initial part of the motion that is skipped, because the person stands still, seconds."""
-_TRUTH: Final = {
-    graph.TRUE_SKELETON: (POINT_CLOUD, SENSOR_DATA),
-    graph.TRUE_ANGLES: (JOINT_STATE, RELIABLE),
-    graph.TRUE_CALIBRATION: (TRANSFORM, LATCHED),
-}
 _CHUNK_BYTES: Final = 32 << 20
 """As in :mod:`body_tracking.simulation.depth_bags`."""
 
@@ -118,7 +113,7 @@ def write_pair_bag(
     with BagWriter(folder, overwrite=overwrite, chunk_bytes=_CHUNK_BYTES, flush_interval_s=float("inf")) as bag:
         for topic in painters:
             bag.add_topic(topic, COMPRESSED_IMAGE, IMAGES)
-        for topic, (type_name, qos) in _TRUTH.items():
+        for topic, (type_name, qos) in TRUTH.items():
             bag.add_topic(topic, type_name, qos)
         pose = replace(poses[0], sensor=RIG_SENSOR)
         bag.write(graph.TRUE_CALIBRATION, serialize(pose_to_transform(pose, WORLD, BAG_MESSAGES)), RECEIVED_FROM_NS)
@@ -134,7 +129,7 @@ def write_pair_bag(
 
 
 def _write_truth(bag: BagWriter, scene: DepthScene, frame: DepthFrame, stamp_ns: int, log_ns: int) -> None:
-    for received_ns, topic, cdr in truth_messages(scene.pose.apply(frame.joints), stamp_ns, log_ns):
+    for received_ns, topic, cdr in truth_messages(scene, frame, stamp_ns, log_ns):
         bag.write(topic, cdr, received_ns)
 
 
@@ -151,7 +146,7 @@ def write_camera_bag(scene: DepthScene, folder: Path, seconds: float, *, overwri
         names.colour_info: (CAMERA_INFO, LATCHED),
         names.depth: (IMAGE, IMAGES),
         names.depth_info: (CAMERA_INFO, LATCHED),
-        **_TRUTH,
+        **TRUTH,
     }
     with BagWriter(folder, overwrite=overwrite, chunk_bytes=_CHUNK_BYTES, flush_interval_s=float("inf")) as bag:
         for topic, (type_name, qos) in topics.items():

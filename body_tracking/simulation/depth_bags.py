@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 
 from body_tracking.core.clocks import ClockModel
+from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.message_types import IMAGE, IMU, JOINT_STATE, POINT_CLOUD, TRANSFORM
 from body_tracking.core.qos import LATCHED, RELIABLE, SENSOR_DATA
 from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skeleton, TrackingState
@@ -27,10 +28,11 @@ from body_tracking.messages.calibration import pose_to_transform
 from body_tracking.messages.cameras import CAMERA_INFO
 from body_tracking.messages.cdr import encode_skeletons
 from body_tracking.messages.imus import imu_to_message
+from body_tracking.messages.model import estimate_to_joint_state
 from body_tracking.pipeline import graph
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, BagWriter, serialize
-from body_tracking.simulation.depth_scene import RATE, SENSOR, DepthScene, held_out, kinect_camera
+from body_tracking.simulation.depth_scene import RATE, SENSOR, DepthFrame, DepthScene, held_out, kinect_camera
 from body_tracking.simulation.makehuman import makehuman_for
 from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS, WORLD
@@ -38,6 +40,13 @@ from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS, WORLD
 SHIPPED: Final = "mesh_reaching"
 """The recording in ``bags/``."""
 SECONDS: Final = 10.0
+TRUTH: Final = {
+    graph.TRUE_SKELETON: (POINT_CLOUD, SENSOR_DATA),
+    graph.TRUE_MODEL_STATE: (JOINT_STATE, SENSOR_DATA),
+    graph.TRUE_ANGLES: (JOINT_STATE, RELIABLE),
+    graph.TRUE_CALIBRATION: (TRANSFORM, LATCHED),
+}
+"""Type and quality of service of each topic with the truth."""
 _DELAY_NS: Final = 30_000_000
 """Time from the capture of an image to its receipt."""
 _CHUNK_BYTES: Final = 32 << 20
@@ -79,9 +88,7 @@ def write_depth_bag(scene: DepthScene, folder: Path, seconds: float, *, overwrit
         info_topic(SENSOR): (CAMERA_INFO, LATCHED),
         graph.skeleton_topic(SENSOR): (POINT_CLOUD, SENSOR_DATA),
         **{f"/{segment}/imu/data": (IMU, SENSOR_DATA) for segment in _FOREARMS},
-        graph.TRUE_SKELETON: (POINT_CLOUD, SENSOR_DATA),
-        graph.TRUE_ANGLES: (JOINT_STATE, RELIABLE),
-        graph.TRUE_CALIBRATION: (TRANSFORM, LATCHED),
+        **TRUTH,
     }
     with BagWriter(folder, overwrite=overwrite, chunk_bytes=_CHUNK_BYTES, flush_interval_s=float("inf")) as bag:
         for topic, (type_name, qos) in topics.items():
@@ -97,7 +104,7 @@ def write_depth_bag(scene: DepthScene, folder: Path, seconds: float, *, overwrit
             image = DepthImage().encode((stamp_ns, scene.camera.frame_id, frame.image), BAG_WIRE)
             messages.append((log_ns, depth_topic(SENSOR), image))
             joints.append(scene.pose.apply(frame.joints))
-            messages += truth_messages(joints[-1], stamp_ns, log_ns)
+            messages += truth_messages(scene, frame, stamp_ns, log_ns)
             progress.at(index)
         messages += _skeletons(scene, np.array(joints))
         for log_ns, topic, cdr in sorted(messages, key=lambda item: item[:2]):
@@ -111,10 +118,15 @@ def capture_times(seconds: float, delay_ns: int = _DELAY_NS) -> tuple[int, int]:
     return START_NS + elapsed_ns, RECEIVED_FROM_NS + elapsed_ns + delay_ns
 
 
-def truth_messages(joints: FloatArray, stamp_ns: int, log_ns: int) -> Iterator[tuple[int, str, bytes]]:
-    """Log time, topic and message of (25, 3) true joints in ``world``, and of their angles."""
+def truth_messages(scene: DepthScene, frame: DepthFrame, stamp_ns: int, log_ns: int) -> Iterator[_Message]:
+    """Log time, topic and message of the true joints in ``world``, of the model's state and of positional angles."""
+    joints = scene.pose.apply(frame.joints)
     truth = Skeleton(stamp_ns, WORLD, joints, np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8))
     yield log_ns, graph.TRUE_SKELETON, encode_skeletons([truth])
+    q, lengths = scene.course(np.array([frame.time])).q[0], scene.who.person.lengths
+    exact, unknown = np.zeros((2 * MODEL.nv, 2 * MODEL.nv)), np.full(MODEL.nv, np.nan)
+    state = ModelEstimate(stamp_ns, WORLD, 0, q, unknown, exact, lengths, np.zeros_like(lengths))
+    yield log_ns, graph.TRUE_MODEL_STATE, serialize(estimate_to_joint_state(state, MODEL, BAG_MESSAGES))
     angles = angles_to_joint_state(positional_angles(truth), graph.DEFAULT_BODY, WORLD, BAG_MESSAGES)
     yield log_ns, graph.TRUE_ANGLES, serialize(angles)
 

@@ -19,9 +19,8 @@ import numpy as np
 from body_tracking.camera.codecs import CompressedColour
 from body_tracking.camera.topics import COMPRESSED, DRIVERS
 from body_tracking.core.clocks import ClockModel
-from body_tracking.core.estimate import ModelEstimate
-from body_tracking.core.message_types import COMPRESSED_IMAGE, IMAGE, IMU, JOINT_STATE, POINT_CLOUD, TRANSFORM
-from body_tracking.core.qos import LATCHED, RELIABLE, SENSOR_DATA, Qos
+from body_tracking.core.message_types import COMPRESSED_IMAGE, IMAGE, IMU, POINT_CLOUD
+from body_tracking.core.qos import LATCHED, SENSOR_DATA, Qos
 from body_tracking.kinect.simulated_sensor import Misreading, SimulatedKinect
 from body_tracking.markers import setup
 from body_tracking.markers.chain import JointDescription
@@ -33,18 +32,16 @@ from body_tracking.mesh.topics import IMAGES, depth_topic, info_topic
 from body_tracking.messages.calibration import pose_to_transform
 from body_tracking.messages.cameras import CAMERA_INFO
 from body_tracking.messages.cdr import encode_skeletons
-from body_tracking.messages.model import estimate_to_joint_state
 from body_tracking.pipeline import graph
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, BagWriter, serialize
 from body_tracking.simulation import marker_bags
 from body_tracking.simulation.camera_bags import pose_around
 from body_tracking.simulation.colour_images import CAMERA, Painter, colour_camera
-from body_tracking.simulation.depth_bags import capture_times, inertial_messages, truth_messages
+from body_tracking.simulation.depth_bags import TRUTH, capture_times, inertial_messages, truth_messages
 from body_tracking.simulation.depth_scene import RATE, SENSOR, DepthScene, held_out, kinect_camera
 from body_tracking.simulation.makehuman import makehuman_for
 from body_tracking.simulation.marker_scene import JOINTS, MarkerScene, scene_of
-from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.repertoire import make_movement
 from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS, WORLD, draw_clock
 
@@ -100,10 +97,7 @@ def make_shipped(bags: Path, config: Path) -> None:
         **{graph.skeleton_topic(sensor): (POINT_CLOUD, SENSOR_DATA) for sensor in (SENSOR, SECOND)},
         **{f"/{segment}/imu/data": (IMU, SENSOR_DATA) for segment in WORN},
         **{setup.balls_topic(camera.frame_id): (POINT_CLOUD, SENSOR_DATA) for camera in markers.rig.cameras},
-        graph.TRUE_SKELETON: (POINT_CLOUD, SENSOR_DATA),
-        graph.TRUE_MODEL_STATE: (JOINT_STATE, SENSOR_DATA),
-        graph.TRUE_ANGLES: (JOINT_STATE, RELIABLE),
-        graph.TRUE_CALIBRATION: (TRANSFORM, LATCHED),
+        **TRUTH,
     }
     folder = bags / SHIPPED
     with BagWriter(folder, overwrite=True, chunk_bytes=_CHUNK_BYTES, flush_interval_s=float("inf")) as bag:
@@ -142,11 +136,7 @@ def _depth_and_truth(scene: DepthScene) -> Iterator[_Message]:
         if index % _EVERY == 0:
             image = DepthImage().encode((stamp_ns, scene.camera.frame_id, frame.image), BAG_WIRE)
             yield log_ns, depth_topic(SENSOR), image
-        yield from truth_messages(scene.pose.apply(frame.joints), stamp_ns, log_ns)
-        q, lengths = scene.course(np.array([frame.time])).q[0], scene.who.person.lengths
-        exact, unknown = np.zeros((2 * MODEL.nv, 2 * MODEL.nv)), np.full(MODEL.nv, np.nan)
-        state = ModelEstimate(stamp_ns, WORLD, 0, q, unknown, exact, lengths, np.zeros_like(lengths))
-        yield log_ns, graph.TRUE_MODEL_STATE, serialize(estimate_to_joint_state(state, MODEL, BAG_MESSAGES))
+        yield from truth_messages(scene, frame, stamp_ns, log_ns)
         progress.at(index)
     progress.end()
 
