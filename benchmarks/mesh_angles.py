@@ -4,36 +4,42 @@ Depth images, readings of the sensors and skeletons of a simulated Kinect v2, of
 the graph of ``body_tracking replay``: calibration, alignment of the sensors, the mesh, fusion, a filter and angles.
 RMSE of shoulder elevation and elbow flexion against the true joints in degrees, in brackets the median stated deviation
 and the share of errors within 1.96 of them, all after the first second. Positional angles of the
-filtered skeletons; ``default`` is ``lkf_constant_velocity``.
+filtered skeletons; ``default`` is ``lkf_constant_velocity``. ``floor``: of the fit of one image a second that starts at
+the true joints.
 """
 
 from __future__ import annotations
 
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import common
 import numpy as np
 from common import ABSENT, NORMAL, mapped, report, verdicts
-from mesh_runs import is_absent, scene_of
+from mesh_runs import fit_from_truth, is_absent, scene_of
 
-from body_tracking.core.skeleton import NANOSECONDS, FloatArray
+from body_tracking.core.joint_angles import JointAngles
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Skeleton, TrackingState
 from body_tracking.evaluation.metrics import wrapped
 from body_tracking.evaluation.reading import read, true_at
 from body_tracking.filters import DEFAULT_FILTER
+from body_tracking.kinematics.positional import positional_angles
+from body_tracking.mesh.body_model import load
+from body_tracking.mesh.depth import DepthCamera, to_metres
 from body_tracking.pipeline import graph
 from body_tracking.recording.replay import ReplaySettings, replay
 from body_tracking.simulation.depth_bags import write_depth_bag
-from body_tracking.simulation.depth_scene import SENSOR
+from body_tracking.simulation.depth_scene import RATE, SENSOR, DepthScene
 
 MOTIONS = ("reaching", "two_handed_wave", "torso_twist", "arm_raises", "slow_down", "squat")
 ANGLES = {
     "elevation": ("shoulder_elevation_left", "shoulder_elevation_right"),
     "elbow": ("elbow_flexion_left", "elbow_flexion_right"),
 }
-MESH, KINECT = "mesh and sensors", "kinect"
+MESH, KINECT, FLOOR = "mesh and sensors", "kinect", "floor"
 FILTERS = {"default": DEFAULT_FILTER, "ekf": "ekf"}
 _FOREARMS = ("forearm_left", "forearm_right")
 _SETTLED_S = 1.0
@@ -61,7 +67,34 @@ def run(job: Job) -> dict[str, dict[str, tuple[FloatArray, FloatArray]]]:
                 out = Path(scratch) / f"{len(found)}"
                 replay(bag, out, settings)
                 found[f"{source}, {label}"] = errors_in(out)
+    found[FLOOR] = floor_of(scene, job.seconds)
     return found
+
+
+def floor_of(scene: DepthScene, seconds: float) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Errors of the angles of fits that start at the true joints, as :func:`errors_in` returns them."""
+    body, view = load().body(), DepthCamera(scene.camera)
+    pairs = []
+    for frame in scene.frames(_SETTLED_S, seconds, round(RATE)):
+        fitted = fit_from_truth(body, view, to_metres(frame.image), frame.person, frame.joints)
+        pairs.append([_positional(scene.pose.apply(joints)) for joints in (fitted, frame.joints)])
+    found = {}
+    for kind, names in ANGLES.items():
+        angles = np.array(
+            [[[each.position[each.names.index(name)] for name in names] for each in both] for both in pairs]
+        )
+        off = wrapped(angles[:, 0] - angles[:, 1])
+        found[kind] = off, np.full(off.shape, np.nan)
+    return found
+
+
+def _named(angles: JointAngles, names: Sequence[str]) -> list[float]:
+    return [float(angles.position[angles.names.index(name)]) for name in names]
+
+
+def _positional(joints: FloatArray) -> JointAngles:
+    """Positional angles of (25, 3) joints in ``world``."""
+    return positional_angles(Skeleton(0, "world", joints, np.full(len(joints), TrackingState.TRACKED, dtype=np.uint8)))
 
 
 def errors_in(recording: Path) -> dict[str, tuple[FloatArray, FloatArray]]:

@@ -2,7 +2,7 @@
 
 RMS errors over people, millimetres, and in brackets the mean error: of upper arms and forearms, of the distance between
 the shoulders, and of thighs. ``one image`` and ``four images``: what ``mesh_tracker`` takes in its first seconds,
-``four images, true start``: the floor, images over the whole motion, started at the true joints; ``kinect``: medians
+``four images, true start``: the floor, the same images started at the true joints; ``kinect``: medians
 of a simulated Kinect's bones over the first four seconds; ``mean person``: without a personalisation.
 """
 
@@ -39,7 +39,6 @@ BONES = {
 BARS = {"arms": 0.010, "shoulders": 0.015, "thighs": 0.020}
 """Largest RMS errors after four images, metres."""
 FOUR, ONE, FLOOR, KINECT, MEAN = "four images", "one image", "four images, true start", "kinect", "mean person"
-_IMAGES = 4
 _SECONDS = 8.0
 _KINECT_S = 4.0
 
@@ -64,15 +63,17 @@ def bones_of(body: Body) -> dict[str, FloatArray]:
     return lengths_of(kinect_landmarks(body).places)
 
 
-def live(scene: DepthScene, frames: Sequence[DepthFrame], images: int) -> Body:
-    """The body after the first personalisation of ``mesh_tracker`` from this number of images; the mean without."""
-    stage = mesh_stage(scene, personalise_from=images)
+def live(scene: DepthScene, frames: Sequence[DepthFrame], images: int) -> tuple[Body, list[DepthFrame]]:
+    """The body after the first personalisation of ``mesh_tracker``, the mean one without, and the images it used."""
+    stage, used = mesh_stage(scene, personalise_from=images), []
     for frame in frames:
-        stamp = round(frame.time * NANOSECONDS)
+        stamp, kept = round(frame.time * NANOSECONDS), len(used)
         list(stage.take(depth_topic(SENSOR), (stamp, "", to_metres(frame.image)), Now(stamp, stamp)))
+        if len(stage.sensor.poses.poses) > kept:
+            used.append(frame)
         if stage.counters["personalisations"]:
             break
-    return stage.sensor.body
+    return stage.sensor.body, used
 
 
 def run(job: Job) -> dict[str, dict[str, FloatArray]]:
@@ -83,13 +84,13 @@ def run(job: Job) -> dict[str, dict[str, FloatArray]]:
     true = {kind: np.median(each, axis=1) for kind, each in lengths_of(joints).items()}
     read = kinect_skeletons(scene, joints[: round(_KINECT_S * RATE)])
     mean, view = load().body(), DepthCamera(scene.camera)
-    started = [
-        fitted_from_truth(mean, view, to_metres(f.image), f.person, f.joints) for f in frames[:: len(frames) // _IMAGES]
-    ]
+    one, _ = live(scene, frames, 1)
+    four, used = live(scene, frames, 4)
+    started = [fitted_from_truth(mean, view, to_metres(f.image), f.person, f.joints) for f in used]
     best = personalise(mean.model, [seen for seen, _ in started], [fit.pose for _, fit in started])
     found = {
-        ONE: bones_of(live(scene, frames, 1)),
-        FOUR: bones_of(live(scene, frames, 4)),
+        ONE: bones_of(one),
+        FOUR: bones_of(four),
         FLOOR: bones_of(best.body),
         KINECT: {kind: np.nanmedian(each, axis=1) for kind, each in lengths_of(read).items()},
         MEAN: bones_of(mean),

@@ -28,6 +28,17 @@ def _conventions() -> Sequence[str]:
     return ALL_CONVENTIONS
 
 
+_OF_MESHES = 0.77
+"""Correlation of the errors of an arm's neighbouring joints in the fit of a mesh (``benchmarks/mesh_fit.py``)."""
+
+
+def _correlation(options: Options) -> dict[str, Value]:
+    """Parameter ``bone_correlation`` of positional angles where no sensor is a Kinect."""
+    if options["depth"] and options["sensors"] == options["computed"]:
+        return {"bone_correlation": _OF_MESHES}
+    return independent_joints(options)
+
+
 def _specs(options: Options) -> Iterable[NodeSpec]:
     if not (options["sensors"] or options["imus"]):
         return
@@ -41,7 +52,7 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
     yield NodeSpec(
         "joint_angles",
         "joint_angles",
-        defaults=independent_joints(options),
+        defaults=_correlation(options),
         parameters={**transport(options), **angles},
     )
 

@@ -214,6 +214,7 @@ class DepthSensor:
         problem: why images are unusable; "" if they are usable, even if nobody is visible.
         placement: pose of the camera in ``world`` and its clock, from the calibration.
         pairs: depth images that wait for their body index.
+        poses: images for the next personalisation.
 
     Raises:
         PersonFileError: the file of the person is invalid.
@@ -236,7 +237,7 @@ class DepthSensor:
             self.body, self._covariance = storage.load(self._file, self._model)
         else:
             self.body, self._covariance = self._nobody()
-        self._poses = DistinctPoses(self._model, 0 if self._known else self._needed)
+        self.poses = DistinctPoses(self._model, 0 if self._known else self._needed)
         self._tracker: MeshTracker | None = None
         self._counters: Counter[str] = Counter()
         self.pairs = IndexPairs(body_index_topic(camera), self._counters)
@@ -291,30 +292,30 @@ class DepthSensor:
         self.problem = COVERED if self._tracker.problem == COVERED else ""
         if self._counters["people lost"] > gone and not self._known:
             # the next person may be somebody else
-            self._poses = DistinctPoses(self._model, self._needed)
+            self.poses = DistinctPoses(self._model, self._needed)
             self._wear(*self._nobody())
-        if tracked is not None and not self._poses.complete:
+        if tracked is not None and not self.poses.complete:
             self._collect(self._tracker, tracked)
         return tracked
 
     def _collect(self, tracker: MeshTracker, tracked: Tracked) -> None:
         """Keep the image if its pose is new, and estimate the shape once there are enough."""
         assert tracker.observation is not None
-        self._poses.offer(tracker.observation, tracked.fit.pose)
-        if not self._poses.complete:
+        self.poses.offer(tracker.observation, tracked.fit.pose)
+        if not self.poses.complete:
             return
         try:
-            person = personalise(self._model, self._poses.observations, self._poses.poses)
+            person = personalise(self._model, self.poses.observations, self.poses.poses)
         except PersonalisationError as error:
             self._events.append(f"{self._camera}: {error}")
             self._counters["failed personalisations"] += 1
-            self._poses = DistinctPoses(self._model, self._needed)
+            self.poses = DistinctPoses(self._model, self._needed)
             return
         self._wear(person.body, person.covariance)
         self._changed = True
         self._counters["personalisations"] += 1
         stature = float(np.ptp(person.body.vertices[:, 1]))
-        self._events.append(f"{self._camera}: body of {stature:.2f} m from {len(self._poses.poses)} images")
+        self._events.append(f"{self._camera}: body of {stature:.2f} m from {len(self.poses.poses)} images")
 
     def _wear(self, body: Body, covariance: FloatArray) -> None:
         self.body, self._covariance = body, covariance
@@ -323,7 +324,7 @@ class DepthSensor:
 
     def personalise_anew(self) -> None:
         """Estimate the shape anew from the next poses, also if a file gave it."""
-        self._poses = DistinctPoses(self._model, self._needed or int(str(_PERSONALISED_FROM.default)))
+        self.poses = DistinctPoses(self._model, self._needed or int(str(_PERSONALISED_FROM.default)))
 
     def mesh_is_due(self, stamp_ns: int) -> bool:
         """Whether the mesh of an image is due for publishing; if so, it counts as published."""

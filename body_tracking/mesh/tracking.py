@@ -1,9 +1,8 @@
 """Tracking of one person through depth images: segmentation, fit, detection of a lost fit.
 
-Each fit starts from the predicted pose. A lost fit is tried again with a wide robust scale, from the last pose and from
-another sensor's skeleton if there is one, and then by a search; a person who stays lost is searched for among the
-candidates of a person's size in turn. A walking person is expected to face the walking direction: such starts are tried
-where the fit leaves points of the person unexplained.
+Each fit starts from the predicted pose. A lost fit is tried again with a wide robust scale from the last pose, and then
+by a search; a person who stays lost is searched for among the candidates of a person's size in turn. A walking person
+is expected to face the walking direction: such starts are tried where the fit leaves points of the person unexplained.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from body_tracking.mesh.energy import Observation, observe
 from body_tracking.mesh.person import COVERED, NOBODY, REACH, PersonFinder, is_covered, near
 from body_tracking.mesh.personalisation import personalise
 from body_tracking.mesh.raster import render
-from body_tracking.mesh.solver import SCALES, WIDE, Fit, JointPoints, MeshFitter, Orientation, Prediction, is_along
+from body_tracking.mesh.solver import SCALES, WIDE, Fit, MeshFitter, Orientation, Prediction, is_along
 from body_tracking.mesh.uncertainty import kinect_landmarks, placed
 
 _RATES: Final = {"shoulder": 9.0, "elbow": 9.0, "wrist": 9.0, "collar": 3.0}
@@ -41,8 +40,6 @@ _KEPT: Final = 0.7
 """Factor on the last change of pose in the prediction."""
 _LONGEST_S: Final = 0.2
 """Longest time between two images for which their change of pose gives a rate, seconds."""
-_SKELETON: Final = 0.08
-"""Metres: standard deviation of the joints of another sensor's skeleton, used as a start."""
 _COURSE_S: Final = 0.5
 """Seconds over which a walking person's velocity is measured."""
 _SLOWEST: Final = 0.35
@@ -177,7 +174,6 @@ class MeshTracker:
         depth: SingleArray,
         index: NDArray[np.uint8] | None = None,
         orientations: Sequence[Orientation] = (),
-        skeleton: Skeleton | None = None,
     ) -> Tracked | None:
         """Track the person in the next image.
 
@@ -186,7 +182,6 @@ class MeshTracker:
             depth: (height, width) metres, 0 where missing.
             index: (height, width) body-index image of the same time, if there is one.
             orientations: of inertial sensors.
-            skeleton: from another sensor in the same frame, used as a start if the person is lost.
 
         Returns:
             The person; None if nobody is found, or the fit is lost.
@@ -214,7 +209,7 @@ class MeshTracker:
         since_ns = stamp_ns - round(_COURSE_S * NANOSECONDS)
         self._places = [each for each in self._places if since_ns <= each[0] < stamp_ns]
         self._places.append((stamp_ns, np.median(self.observation.points, axis=0)))
-        fit = self._fit(stamp_ns, self.observation, orientations, skeleton)
+        fit = self._fit(stamp_ns, self.observation, orientations)
         if fit is None:
             return None
         if fit.lost:
@@ -240,18 +235,15 @@ class MeshTracker:
         self.problem = COVERED if is_covered(depth) else NOBODY if body is None else ""
         return mask
 
-    def _fit(
-        self, stamp_ns: int, seen: Observation, orientations: Sequence[Orientation], skeleton: Skeleton | None
-    ) -> Fit | None:
+    def _fit(self, stamp_ns: int, seen: Observation, orientations: Sequence[Orientation]) -> Fit | None:
         """The best available fit; None if it is not yet time to search again."""
-        points = None if skeleton is None else self._points_of(skeleton)
         if self._fits:
             prediction = self._predicted(stamp_ns, seen)
             fit = self._fitter.fit(seen, prediction.pose, prediction, orientations)
             if not fit.lost:
                 return self._or_better(stamp_ns, seen, orientations, fit)
             self.counters["second starts"] += 1
-            fits = [fit, self._fitter.fit(seen, self._fits[-1][1].pose, None, orientations, points, WIDE)]
+            fits = [fit, self._fitter.fit(seen, self._fits[-1][1].pose, None, orientations, scales=WIDE)]
             course = self._course()
             if (course is not None or all(each.lost for each in fits)) and self._may_search(stamp_ns):
                 fits.append(self._fitter.search(seen, orientations, course))
@@ -259,10 +251,7 @@ class MeshTracker:
         if not self._may_search(stamp_ns):
             self.problem = "searching"
             return None
-        fit = self._searched(seen, orientations)
-        if points is not None and fit.lost:
-            fit = self._fitter.fit(seen, fit.pose, None, orientations, points, WIDE)
-        return fit
+        return self._searched(seen, orientations)
 
     def _searched(self, seen: Observation, orientations: Sequence[Orientation]) -> Fit:
         """The best fit of an untracked person; a smaller body is kept if only it fits."""
@@ -344,20 +333,6 @@ class MeshTracker:
                 pose = Pose(rotations, pose.translation + share * (pose.translation - before.pose.translation))
         hidden = self._fitter.hidden(seen, last.posed.vertices)
         return Prediction(pose, 0.01 + _SHIFT_RATE * elapsed, 0.05 + self._rates * elapsed, hidden)
-
-    def _points_of(self, skeleton: Skeleton) -> JointPoints | None:
-        """The joints common to the body model and the skeleton."""
-        names = self.body.model.joint_names
-        pairs = [
-            (names.index(f"{side}_{name}"), number)
-            for number, joint in enumerate(skeleton.joints.names)
-            for name, _, side in [joint.lower().partition("_")]
-            if skeleton.valid[number] and side and f"{side}_{name}" in names
-        ]
-        if not pairs:
-            return None
-        own, theirs = np.array(pairs, dtype=np.intp).T
-        return JointPoints(own, skeleton.positions[theirs], _SKELETON)
 
     def _forget(self, stamp_ns: int) -> None:
         """Note that the person is lost; after ``predict_for`` seconds forget them."""
