@@ -35,12 +35,12 @@ def test_problems_are_named_by_their_nodes(tmp_path: Path) -> None:
     monitor = object.__new__(GraphMonitor)  # without a node
     monitor._statuses, monitor.angles = found, 0
     options = {"bag": "arm", "record": None}
-    end = "played arm in 3.0 s with start and end: 0 frames of joint angles"
+    end = "played arm in 3.0 s (start and end included): 0 frames of joint angles"
     assert monitor.summary(options, 3.0, {}) == f"{end} (imu_skeleton: forearm_left: not aligned)"
     monitor.angles = 7
-    assert monitor.summary(options, 3.0, {}) == "played arm in 3.0 s with start and end: 7 frames of joint angles"
+    assert monitor.summary(options, 3.0, {}) == "played arm in 3.0 s (start and end included): 7 frames of joint angles"
     stopped = monitor.summary(options, 3.0, {}, played=False)
-    assert stopped == "stopped before the end of arm, after 3.0 s with the start: 7 frames of joint angles"
+    assert stopped == "stopped before the end of arm, after 3.0 s (start included): 7 frames of joint angles"
     options["record"] = str(tmp_path / "session")
     assert monitor.summary(options, 3.0, {}).endswith(", nothing was recorded")  # the first message makes it
     (tmp_path / "session").mkdir()

@@ -578,22 +578,31 @@ class OnlineCalibration:
             return
         other.started = best.rotation, best.translation
         other.turned = best.turned
-        if not other.estimated and best.rotation_stddev > other.quality.rotation_stddev:
+        if not other.estimated:
             # A loaded calibration of smaller stated uncertainty stays, unless the estimate contradicts it.
-            if not other.clock_locked or not self._contradicts(best, other):
+            moved = other.rotation is not None and self._contradicts(best, other)
+            if best.rotation_stddev > other.quality.rotation_stddev and not (moved and other.clock_locked):
                 return
-            self.events.append(f"{name}: does not stand where the saved calibration says; estimating anew")
+            if moved:
+                apart, shift = self._difference(best, other)
+                self.events.append(
+                    f"{name}: does not stand where the saved calibration says, but {1e3 * shift:.0f} mm and "
+                    f"{np.degrees(apart):.1f} deg away; estimated anew"
+                )
         other.estimated = True
         other.quality = SensorQuality(best.residual, best.rotation_stddev, best.translation_stddev, frames=len(pairs))
         self._set_target(other, best.rotation, best.translation, best.centre)
 
     @staticmethod
-    def _contradicts(found: PairEstimate, other: _Sensor) -> bool:
-        """Whether published pose and estimate differ by more than their uncertainties explain."""
+    def _difference(found: PairEstimate, other: _Sensor) -> tuple[float, float]:
+        """Between the published pose and an estimate: radians, and metres at the place of the person."""
         assert other.rotation is not None
-        apart = _angle_between(found.rotation, other.rotation)
         place = other.rotation @ found.rotation.T @ (found.centre - found.translation) + other.translation
-        shift = np.linalg.norm(place - found.centre)
+        return _angle_between(found.rotation, other.rotation), float(np.linalg.norm(place - found.centre))
+
+    def _contradicts(self, found: PairEstimate, other: _Sensor) -> bool:
+        """Whether published pose and estimate differ by more than their uncertainties explain."""
+        apart, shift = self._difference(found, other)
         return bool(
             apart > MOVED_SIGMAS * np.hypot(found.rotation_stddev, other.quality.rotation_stddev)
             or shift > 0.05 + MOVED_SIGMAS * np.hypot(found.translation_stddev, other.quality.translation_stddev)

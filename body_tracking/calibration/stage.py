@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -13,6 +13,7 @@ from body_tracking.calibration.storage import load, save
 from body_tracking.core.names import TF_STATIC
 from body_tracking.core.parameters import Parameter, Value, fields_of, parameters_from
 from body_tracking.core.qos import LATCHED, Qos
+from body_tracking.core.sensor_poses import CalibrationResult
 from body_tracking.core.skeleton import Joint, Skeleton
 from body_tracking.messages.codecs import Clock, Pose, Poses, SensorClock
 from body_tracking.pipeline import graph
@@ -69,7 +70,9 @@ class CalibrationStage(Stage):
         self.calibration = OnlineCalibration(sensors, parameters, str(values["reference"]) or None)
         self._file = Path(str(values["calibration_file"])).expanduser() if values["calibration_file"] else None
         if self._file is not None and self._file.exists():
-            self.calibration.load(load(self._file))
+            loaded = load(self._file)
+            self.calibration.load(loaded)
+            self.events.append(f"{self._file}: loaded{lacking(loaded, sensors)}")
         self._unsaved = False
         self._subjects = {sensor: SubjectSelector() for sensor in sensors}
         self._odd: dict[str, tuple[int, float]] = {}
@@ -149,4 +152,13 @@ class CalibrationStage(Stage):
         if self._file is not None and self._unsaved:
             # The published poses, not the estimates toward which they still slew: a restart must not jump.
             save(self.calibration.current_update().result, self._file)
+            self.events.append(f"saved to {self._file}")
             self._unsaved = False
+
+
+def lacking(saved: CalibrationResult, sensors: Sequence[str]) -> str:
+    """What a saved calibration lacks, for a message; empty if it has all sensors."""
+    missing = [sensor for sensor in sensors if sensor not in saved.poses]
+    if not missing:
+        return ""
+    return f"; it has {', '.join(saved.poses)}, but not {', '.join(missing)}, to be estimated from movement"

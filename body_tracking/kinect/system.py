@@ -135,7 +135,7 @@ SYSTEM = System(
         Option(
             "sensors",
             graph.DEFAULT_SENSORS,
-            "the sensors, the reference first, or none (default: those in the bag, else kinect1,kinect2)",
+            "the sensors, the reference first, or none (default: those in the bag, or those that publish)",
             "A,B",
             offline=True,
         ),

@@ -76,6 +76,8 @@ def calibrate(
             progress.at(log_time_ns)
         progress.end()
         events = [*bag.warnings, *(f"{name}: {count}" for name, count in sorted(counters.items()))]
+    if len(names) < 2:
+        raise CalibrationError(f"{bag_path}: only the sensor {names[0]}: nothing to calibrate it against")
     if not frames:
         raise CalibrationError(f"{bag_path}: no frame can be used ({'; '.join(events) or 'there is none'})")
     result = calibration.finish()

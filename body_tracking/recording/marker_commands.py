@@ -25,7 +25,7 @@ from body_tracking.markers import setup
 from body_tracking.markers.boards import Chessboard
 from body_tracking.markers.camera_calibration import calibrate_cameras, find_boards
 from body_tracking.markers.chain import ChainFit, JointDescription, fit_chain
-from body_tracking.markers.chain_files import save_chain, to_urdf
+from body_tracking.markers.chain_files import load_chain, save_chain, to_urdf
 from body_tracking.markers.codecs import PoseOfTarget, SpacePoints
 from body_tracking.markers.corrections import calibration_effects, shape_effects
 from body_tracking.markers.distinct import check_distinct
@@ -344,6 +344,16 @@ def check(args: argparse.Namespace) -> int:
         f"cameras: {', '.join(report['cameras']) or 'none, points of another system only'}",
         f"targets: {', '.join(f'{each.name} ({len(each.points)} balls)' for each in targets)}; no two are alike",
     ]
+    if (args.setup / setup.CHAIN).exists():
+        joints = load_chain(args.setup / setup.CHAIN).joints
+        report["joints"] = {each.name: each.kind.value for each in joints}
+        lines.append(f"joints: {', '.join(f'{each.name} ({each.kind.value})' for each in joints)}")
+        lines.append(f"whole: body_tracking up --marker-setup {args.setup}")
+    else:
+        report["joints"] = {}
+        lines.append(
+            f"joints: none, the targets have poses but no angles; body_tracking markers fit makes {setup.CHAIN}"
+        )
     return _say(args, report, lines)
 
 

@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
+from body_tracking.calibration.stage import lacking
 from body_tracking.calibration.storage import load
 from body_tracking.core.clocks import jumped_back
 from body_tracking.core.errors import BodyTrackingError
@@ -32,7 +33,7 @@ from body_tracking.pipeline.people import SubjectSelector
 from body_tracking.pipeline.roles import ROLES
 from body_tracking.pipeline.system import Options
 from body_tracking.recording import forked
-from body_tracking.recording.finding import advice_for
+from body_tracking.recording.finding import advice_for, unused
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, check_new_bag, deserialize
@@ -135,6 +136,7 @@ class ReplayReport:
         elapsed_s: computing time.
         counters: of events and unusable messages.
         warnings: missing or damaged parts of the bag, and what nodes would report at its end.
+        unused: sources in the bag that no option takes, after these options.
     """
 
     frames: int
@@ -144,6 +146,7 @@ class ReplayReport:
     elapsed_s: float
     counters: Mapping[str, int]
     warnings: tuple[str, ...]
+    unused: str = ""
 
 
 def sensor_topics(bag: BagReader, wanted: Sequence[str] = (), advice: str = "") -> dict[str, str]:
@@ -230,10 +233,13 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
         except graph.GraphError as error:
             raise ReplayError(f"{bag_path}: {error}") from error
         settings = replace(settings, more={**settings.more, "played": sources})
+        others = unused({name: each.type_name for name, each in bag.topics.items()}, settings.options())
         kept = tuple(dict.fromkeys((*topics, *truth, *sources)))
         passed = {topic: (bag.topics[topic].type_name, bag.topics[topic].qos) for topic in kept}
+        notes = []
         if settings.calibration_file is not None:
-            load(settings.calibration_file)  # raises if it is missing or invalid
+            lack = lacking(load(settings.calibration_file), settings.sensors)  # raises if it is missing or invalid
+            notes = [f"{settings.calibration_file}{lack}"] if lack else []
         all_stages = settings.stages()
         # the stages may raise: construct them before `out` is replaced
         first = {each.node: each.make() for each in all_stages if not forked.is_second(each.executable)}
@@ -281,7 +287,8 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
             (bag.end_ns - bag.start_ns) / NANOSECONDS,
             time.perf_counter() - began,
             {name: count for name, count in sorted(counters.items()) if count},
-            (*bag.warnings, *problems),
+            (*bag.warnings, *notes, *problems),
+            others,
         )
 
 
@@ -408,6 +415,8 @@ def run(args: argparse.Namespace) -> int:
     if report.filter_name:
         others = f"; the recorded angles (filter {', '.join(report.recorded_filters)}) are not read"
         print(f"filter: {report.filter_name}{others if report.recorded_filters else ''}")
+    if report.unused:
+        print(f"also in the recording, not taken without an option: {report.unused}")
     for line in summary(args.output):
         print(line)
     if args.verbose:

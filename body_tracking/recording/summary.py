@@ -50,9 +50,10 @@ def _poses(bag: BagReader) -> Iterator[str]:
             yield f"{sensor}: the reference sensor; world begins at it, with x where it looks and z upwards"
             continue
         left, down = np.round(np.degrees([np.arctan2(ahead[1], ahead[0]), np.arcsin(np.clip(-ahead[2], -1.0, 1.0))]))
+        tilt = f"{abs(down):.0f} deg {'up' if down < 0.0 else 'down'}" if down else "level"
         yield (
             f"{sensor}: at x {x:.2f}, y {y:.2f}, z {z:.2f} m of world, looks {abs(left):.0f} deg to the "
-            f"{'right' if left < 0.0 else 'left'} of x and {abs(down):.0f} deg {'up' if down < 0.0 else 'down'}"
+            f"{'right' if left < 0.0 else 'left'} of x and {tilt}"
         )
 
 
@@ -85,5 +86,6 @@ def _angles(bag: BagReader, body: str) -> Iterator[str]:
             size = " to ".join(dict.fromkeys((f"{min(medians):.1f}", f"{max(medians):.1f}")))
             least = min(shares, key=lambda name: shares[name])
             rare = f" ({least} least often)" if round(shares[least]) < round(max(shares.values())) else ""
-            text += f", each in at least {shares[least]:.0f} % of the frames{rare}; median {size} deg"
+            share = f"at least {shares[least]:.0f} % of the frames" if shares[least] < 99.5 else "every frame"
+            text += f", each in {share}{rare}; median {size} deg"
         yield text + (f"; not {', '.join(unknown)}" if unknown else "")

@@ -473,7 +473,7 @@ class Follower:
                 self._enter(State.STOPPED, f"held for {since:.1f} s: {fault}", steady_ns)
                 self._tracking_fault = ""
             else:
-                waits = f"begins after {limits.recover_after:g} s without a fault, {good:.2f} s are over"
+                waits = f"{good:.2f} s without a fault, {limits.recover_after:g} needed"
                 self._reason = fault or (f"{waits}; the last was: {self._last_fault}" if self._last_fault else waits)
         elif self.state == State.APPROACHING and since >= limits.approach:
             self._enter(State.FOLLOWING, "the rates have reached their limits", steady_ns)

@@ -291,9 +291,9 @@ class GraphMonitor:
         seconds = f"{elapsed:.1f} s"
         what = f"ran for {seconds}"
         if options["bag"] and played:
-            what = f"played {options['bag']} in {seconds} with start and end"
+            what = f"played {options['bag']} in {seconds} (start and end included)"
         elif options["bag"]:
-            what = f"stopped before the end of {options['bag']}, after {seconds} with the start"
+            what = f"stopped before the end of {options['bag']}, after {seconds} (start included)"
         text = f"{what}: {self.angles} frames of joint angles"
         problems = () if self.angles else problem_parts(self._statuses)
         text += f" ({'; '.join(problems)})" if problems else ""

@@ -68,6 +68,8 @@ _REPORT_S = 1.0
 """Seconds between two reports of a node in ``/diagnostics``."""
 _LOOK_S = 0.2
 """Seconds between two checks whether to report."""
+_NAMELESS = "_NODE_NAME_UNKNOWN_"
+"""What rclpy calls a publisher whose node is no longer known."""
 _FAILURES = 10
 """Consecutive failed callbacks of one input after which the node resets its state."""
 _STATE_LEVELS = ("OK", "warning", "error", "stale")
@@ -559,7 +561,12 @@ class GraphNode(BatchNode):
     def publishers_of(self, topic: str) -> list[str]:
         """Full names of the nodes that publish a topic, this one included; DDS lists a killed node for 20 s more."""
         found = self.get_publishers_info_by_topic(topic)
-        return sorted(f"{each.node_namespace.rstrip('/')}/{each.node_name}" for each in found)
+        return sorted(
+            "a node that no longer answers"
+            if _NAMELESS in each.node_name
+            else f"{each.node_namespace.rstrip('/')}/{each.node_name}"
+            for each in found
+        )
 
     def _doubled(self) -> dict[str, list[str]]:
         """The publishers of inputs that must have one publisher and have several.

@@ -191,7 +191,8 @@ def all_parameters(
         without_backend = given.get("backend") in (None, "recording") and not given.get("file")
         if spec.executable == "kinect_skeleton" and without_backend:
             raise UpError(
-                f"{spec.name}: nothing to read: give a bag, or a parameters file with this sensor's backend or file"
+                f"{spec.name}: nothing to read: give a bag, a parameters file with this sensor's backend or file, or "
+                "--external if another program publishes its skeletons"
             )
         if spec.executable == "bag_player":
             count = subscribers(specs, result)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import os
 import queue
+import signal
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -55,6 +56,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """``body_tracking view``."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a script's background jobs ignore SIGINT
     dds.stay_on_this_machine()
     dds.prepare()
     try:

@@ -447,8 +447,13 @@ def test_a_clock_that_drifts_far_is_followed() -> None:
         assert abs(off) < 0.01
 
 
-def test_a_sensor_that_was_moved_since_is_found_where_it_is() -> None:
-    calibration, _ = run(stream(14.0), saved=saved_after(turned=20.0))
+@pytest.mark.parametrize("stddev", [None, 0.05])
+def test_a_sensor_that_was_moved_since_is_named_and_found_where_it_is(stddev: float | None) -> None:
+    """Also where the saved pose is stated to be less certain than the new one."""
+    saved = saved_after(turned=20.0)
+    if stddev is not None:
+        saved.quality["kinect2"] = replace(saved.quality["kinect2"], rotation_stddev=stddev, translation_stddev=stddev)
+    calibration, _ = run(stream(14.0), saved=saved)
     assert any("does not stand where" in event for event in calibration.events)
     assert yaw_error(calibration.finish()) < 1.0
 

@@ -226,7 +226,7 @@ def test_a_real_recording_is_imported_whole(shared_data: Path, tmp_path: Path) -
     assert [len(points.positions) for points in found] == seen.tolist()
 
 
-def test_a_c3d_file_becomes_angles_without_cameras(tmp_path: Path) -> None:
+def test_a_c3d_file_becomes_angles_without_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Two targets on a hinge: measured by their labels, tracked without them; the angle is as exact as stated."""
     rng, noise = np.random.default_rng(0), 3e-4
     angles = np.radians(40.0) * np.sin(np.linspace(0.0, 6.0, 60))
@@ -243,11 +243,16 @@ def test_a_c3d_file_becomes_angles_without_cameras(tmp_path: Path) -> None:
         ["markers", "target", str(path), "--name", "shank", "--labels", "e,f,g,h", "--setup", str(lab)],
         ["import", str(path), "-o", str(bag), "--noise", str(noise)],
         ["markers", "fit", str(bag), "--joint", "knee:hinge:thigh:shank", "--setup", str(lab)],
-        ["markers", "check", "--setup", str(lab)],
         ["markers", "angles", str(bag), "-o", str(out), "--setup", str(lab)],
         ["replay", str(bag), "-o", str(tmp_path / "replayed"), "--marker-setup", str(lab)],
     ):
         assert cli.main(words) == 0, words
+    capsys.readouterr()
+    assert cli.main(["markers", "check", "--setup", str(lab)]) == 0
+    assert f"joints: knee (hinge)\nwhole: body_tracking up --marker-setup {lab}" in capsys.readouterr().out
+    (lab / "chain.yaml").unlink()
+    assert cli.main(["markers", "check", "--setup", str(lab)]) == 0
+    assert "joints: none" in capsys.readouterr().out
     tracked, replayed = read(out).angles, read(tmp_path / "replayed").angles
     np.testing.assert_array_equal(replayed.known, tracked.known)
     assert len(tracked.known) >= 0.98 * len(angles)

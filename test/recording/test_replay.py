@@ -378,7 +378,7 @@ def test_the_summary_of_a_replay_has_poses_and_known_angles(replayed_wave: Path,
     ]
     assert all(
         re.search(
-            r"[1-9] of \d angles with a standard deviation below 30 deg, each in at least \d+ % of .*; median \d",
+            r"[1-9] of \d angles with a standard deviation below 30 deg, each in (at least \d|every).*; median \d",
             line,
         )
         for line in lines[2:]
@@ -615,6 +615,18 @@ def test_inertial_sensors_without_a_pose_are_named(tmp_path: Path, command: Comm
     code, _, reported = command(*words)
     assert code == 2 and reported.count("\n") == 1 and "(imu_skeleton: forearm_left: not aligned)" in reported
     assert not (tmp_path / "out").exists()
+
+
+def test_what_a_calibration_lacks_and_what_no_option_takes_is_named(tmp_path: Path, command: Command) -> None:
+    brief, file = beginning(BAG, tmp_path / "brief", 2.0), tmp_path / "lab.yaml"
+    assert command("calibrate", BAG, "-o", file)[0] == 0
+    file.write_text(file.read_text().replace("kinect2", "kinect9"))
+    code, _, reported = command("replay", brief, "-o", tmp_path / "out", "--calibration", file)
+    assert code == 0 and "lab.yaml; it has kinect1, kinect9, but not kinect2" in reported
+    code, printed, _ = command("replay", ROOT / "bags" / "mesh_reaching", "-o", tmp_path / "skeletons")
+    assert code == 0 and "not taken without an option: --imus: forearm_left, forearm_right" in printed
+    code, _, reported = command("calibrate", ROOT / "bags" / "mesh_reaching")
+    assert code == 2 and "only the sensor kinect1" in reported
 
 
 def test_errors_have_one_base() -> None:

@@ -116,7 +116,7 @@ WRONG = {
     ("viewer:=yes", "bag:={bag}"): "viewer:=yes: expected true or false",
     ("sensors:=kinect1,kinect7", "bag:={bag}"): "no topic /kinect7/skeleton; its sensors are kinect1, kinect2",
     ("bag:=nowhere",): "nowhere: no such recording",
-    (): "nothing to read: give a bag, or a parameters file",
+    (): "nothing to read: give a bag, a parameters file",
     ("bag:={bag}", "record:=there"): "there: exists already",
     ("bag:={bag}", "namespace:=1st"): "1st",
     ("bag:={bag}", "rate:=fast"): "rate: invalid float value: 'fast'",
