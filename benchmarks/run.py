@@ -73,6 +73,8 @@ BENCHMARKS = {
     "mesh_hard": Benchmark(20, MAKEHUMAN),
     "mesh_baseline": Benchmark(6, MAKEHUMAN),
     "mesh_live": Benchmark(4),
+    "mesh_person": Benchmark(4, MAKEHUMAN),
+    "mesh_angles": Benchmark(10, MAKEHUMAN),
     "mesh_real": Benchmark(1, recordings("depth_turn")),
     "imu_pendulum": Benchmark(1, IMU),
     "imu_recordings": Benchmark(1, IMU),
