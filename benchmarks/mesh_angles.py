@@ -3,9 +3,8 @@
 Depth images, readings of the sensors and skeletons of a simulated Kinect v2, of held-out people in clothes, go through
 the graph of ``body_tracking replay``: calibration, alignment of the sensors, the mesh, fusion, a filter and angles.
 RMSE of shoulder elevation and elbow flexion against the true joints in degrees, in brackets the median stated deviation
-and the share of errors within 1.96 of them, all after the first second. Positional angles of the
-filtered skeletons; ``default`` is ``lkf_constant_velocity``. ``floor``: of the fit of one image a second that starts at
-the true joints.
+and the share of errors within 1.96 of them, all after the first second. Positional angles of the filtered skeletons;
+``default`` is ``lkf_constant_velocity``. ``floor``: fits of one image a second, which start at the true joints.
 """
 
 from __future__ import annotations
@@ -76,7 +75,7 @@ def floor_of(scene: DepthScene, seconds: float) -> dict[str, tuple[FloatArray, F
     body, view = load().body(), DepthCamera(scene.camera)
     pairs = []
     for frame in scene.frames(_SETTLED_S, seconds, round(RATE)):
-        fitted = fit_from_truth(body, view, to_metres(frame.image), frame.person, frame.joints)
+        fitted = fit_from_truth(body, view, to_metres(frame.image), frame.person, frame.joints).points
         pairs.append([_positional(scene.pose.apply(joints)) for joints in (fitted, frame.joints)])
     found = {}
     for kind, names in ANGLES.items():
@@ -141,7 +140,9 @@ def main() -> int:
                 row[name] = figures_of(*(np.concatenate(part) for part in zip(*parts, strict=True)))
                 every[name].append(row[name])
             table[f"{kind}, {motion}"] = {
-                name: f"{each['rmse']:.1f} ({each['stated']:.1f}, {each['inside']:.2f})" for name, each in row.items()
+                name: f"{each['rmse']:.1f}"
+                + ("" if name == FLOOR else f" ({each['stated']:.1f}, {each['inside']:.2f})")
+                for name, each in row.items()
             }
         for label in FILTERS:
             mesh, kinect = (every[f"{source}, {label}"] for source in (MESH, KINECT))

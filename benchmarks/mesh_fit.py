@@ -79,7 +79,7 @@ def run(job: Job) -> Run:
         found.append(skeleton.positions[ARMS] - frame.joints[ARMS])
         covariances.append(skeleton.covariances[ARMS])
         if number % _FLOOR == 0:
-            points = fit_from_truth(stage.sensor.body, view, depth, frame.person, frame.joints)
+            points = fit_from_truth(stage.sensor.body, view, depth, frame.person, frame.joints).points
             floor.append(points[ARMS] - frame.joints[ARMS])
     joints = np.array(truth)
     positions = kinect_skeletons(scene, joints)

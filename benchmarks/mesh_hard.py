@@ -132,7 +132,7 @@ def run_fast(job: Job) -> FastRun:
         errors.append(_off(skeleton, frame.joints))
         inferred.append(np.ones(6, np.bool_) if skeleton is None else skeleton.states[ARMS] != TrackingState.TRACKED)
         if number % _FLOOR == 0:
-            points = fit_from_truth(stage.sensor.body, view, depth, frame.person, frame.joints)
+            points = fit_from_truth(stage.sensor.body, view, depth, frame.person, frame.joints).points
             floor.append(np.linalg.norm((points - frame.joints)[ARMS], axis=1))
     joints = np.array(truth)
     kinect = np.linalg.norm((kinect_skeletons(scene, joints) - joints)[:, ARMS], axis=2)
@@ -322,7 +322,7 @@ def run_walk(job: Job) -> WalkRun:
             continue
         if _off(skeleton, frame.joints).mean() < LOST:
             return WalkRun(frame.time - begin, True)
-    points = fit_from_truth(stage.sensor.body, view, depth, frame.person, frame.joints)
+    points = fit_from_truth(stage.sensor.body, view, depth, frame.person, frame.joints).points
     floor = bool(np.linalg.norm((points - frame.joints)[ARMS], axis=1).mean() < LOST)
     return WalkRun(float("inf"), floor)
 
@@ -378,7 +378,7 @@ def run_trunk(job: Job) -> TrunkRun:
         "mesh": {s: each.positions for s, each in mesh.items()},
         "kinect": {s: each.positions for s, each in kinect.items()},
         "floor": {
-            s: fit_from_truth(stage.sensor.body, view, to_metres(f.image), f.person, f.joints)
+            s: fit_from_truth(stage.sensor.body, view, to_metres(f.image), f.person, f.joints).points
             for s, f in [*zip(stamps, frames, strict=True)][::_FLOOR]
         },
     }

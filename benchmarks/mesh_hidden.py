@@ -175,7 +175,7 @@ def run(job: Job) -> HiddenRun:
     tracks["floor"] = {}
     for stamp, side in chosen[::_FLOOR]:
         mask = persons[stamp] & (images[stamp] > _nearer(truth[stamp], side) + 0.1)
-        found = fit_from_truth(body, view, images[stamp], mask, truth[stamp], turned[stamp])
+        found = fit_from_truth(body, view, images[stamp], mask, truth[stamp], turned[stamp]).points
         tracks["floor"][stamp] = found, unstated
     read = _kinect(scene, np.array([*truth.values()]))
     tracks["kinect"] = {stamp: (positions, unstated) for stamp, positions in zip(truth, read, strict=True)}

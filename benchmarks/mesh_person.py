@@ -15,7 +15,7 @@ from typing import NamedTuple
 import common
 import numpy as np
 from common import ABSENT, mapped, report, verdicts
-from mesh_runs import fitted_from_truth, is_absent, kinect_skeletons, mesh_stage, scene_of
+from mesh_runs import fit_from_truth, is_absent, kinect_skeletons, mesh_stage, scene_of
 
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint
 from body_tracking.mesh.body_model import Body, load
@@ -86,8 +86,8 @@ def run(job: Job) -> dict[str, dict[str, FloatArray]]:
     mean, view = load().body(), DepthCamera(scene.camera)
     one, _ = live(scene, frames, 1)
     four, used = live(scene, frames, 4)
-    started = [fitted_from_truth(mean, view, to_metres(f.image), f.person, f.joints) for f in used]
-    best = personalise(mean.model, [seen for seen, _ in started], [fit.pose for _, fit in started])
+    started = [fit_from_truth(mean, view, to_metres(f.image), f.person, f.joints) for f in used]
+    best = personalise(mean.model, [each.seen for each in started], [each.fit.pose for each in started])
     found = {
         ONE: bones_of(one),
         FOUR: bones_of(four),

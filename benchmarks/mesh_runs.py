@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from common import ABSENT, progress
@@ -91,6 +91,20 @@ def fed(
                 yield output.stamp_ns, output.payload
 
 
+class FitFromTruth(NamedTuple):
+    """A fit that started at the truth.
+
+    Attributes:
+        points: (25, 3) joints in the optical frame, metres.
+        seen: what was fitted.
+        fit: of the body.
+    """
+
+    points: FloatArray
+    seen: Observation
+    fit: Fit
+
+
 def fit_from_truth(
     body: Body,
     view: DepthCamera,
@@ -98,8 +112,8 @@ def fit_from_truth(
     person: BoolArray,
     joints: FloatArray,
     orientations: Sequence[Orientation] = (),
-) -> FloatArray:
-    """(25, 3) joints of the floor, metres: the fit of one image that starts at the true joints of the arms.
+) -> FitFromTruth:
+    """The floor: the fit of one image that starts at the true joints of the arms.
 
     Args:
         body: of the person.
@@ -109,26 +123,15 @@ def fit_from_truth(
         joints: (25, 3) true joints in the optical frame, metres.
         orientations: of inertial sensors.
     """
-    seen, fit = fitted_from_truth(body, view, depth, person, joints, orientations)
-    return placed(MeshFitter(body), fit, seen, kinect_landmarks(body), np.eye(len(body.shape))).points
-
-
-def fitted_from_truth(
-    body: Body,
-    view: DepthCamera,
-    depth: SingleArray,
-    person: BoolArray,
-    joints: FloatArray,
-    orientations: Sequence[Orientation] = (),
-) -> tuple[Observation, Fit]:
-    """The points of :func:`fit_from_truth`, and their fit."""
     fitter = MeshFitter(body)
     seen = observe_person(view, depth, person, 600)
     own = np.array([body.model.index(name) for name in JOINTS])
     points = JointPoints(own, joints[ARMS], _STARTED)
     start = fitter.neutral(joints[Joint.SPINE_BASE])
     near = fitter.fit(seen, start, joints=points, orientations=orientations, scales=WIDE)
-    return seen, fitter.fit(seen, near.pose, orientations=orientations)
+    fit = fitter.fit(seen, near.pose, orientations=orientations)
+    points = placed(fitter, fit, seen, kinect_landmarks(body), np.eye(len(body.shape))).points
+    return FitFromTruth(points, seen, fit)
 
 
 def kinect_skeletons(

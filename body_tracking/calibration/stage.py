@@ -73,7 +73,7 @@ class CalibrationStage(Stage):
             loaded = load(self._file)
             self.calibration.load(loaded)
             self.events.append(f"{self._file}: loaded{lacking(loaded, sensors)}")
-        self._unsaved = False
+        self._unsaved = self._saved = False
         self._subjects = {sensor: SubjectSelector() for sensor in sensors}
         self._odd: dict[str, tuple[int, float]] = {}
         """Frames in a row with an impossible trunk, and its last length, metres."""
@@ -152,8 +152,9 @@ class CalibrationStage(Stage):
         if self._file is not None and self._unsaved:
             # The published poses, not the estimates toward which they still slew: a restart must not jump.
             save(self.calibration.current_update().result, self._file)
-            self.events.append(f"saved to {self._file}")
-            self._unsaved = False
+            if not self._saved:  # not each time: it is every few seconds at first
+                self.events.append(f"{self._file}: written, and again whenever the estimate changes")
+            self._saved, self._unsaved = True, False
 
 
 def lacking(saved: CalibrationResult, sensors: Sequence[str]) -> str:

@@ -253,19 +253,11 @@ def _calibration_table(result: Evaluation) -> Table:
     return Table("calibration", title, tuple(each.sensor for each in found), columns, note)
 
 
-_NO_DELAY = 0.005
-"""Seconds: a shorter delay is below what the comparison shows."""
-
-
 def _facts(result: Evaluation) -> tuple[tuple[str, str], ...]:
     estimate, truth = result.estimate, result.truth
     first, last = result.span
     length = float(truth.stamps_ns[-1] - truth.stamps_ns[0]) / NANOSECONDS
-    delay = f"{1e3 * result.delay:.1f} ms"
-    if abs(result.delay) > _NO_DELAY:
-        delay += f": the estimate {'follows' if result.delay > 0.0 else 'is ahead of'} the truth"
-    else:
-        delay += ", which is none"
+    delay = f"{1e3 * result.delay:.1f} ms of the estimate after the truth"
     rows = [
         ("estimate", f"{estimate.source} {estimate.topic}: {len(estimate.stamps_ns)} frames"),
         ("truth", f"{truth.source} {truth.topic}".rstrip() + f": {len(truth.stamps_ns)} frames"),

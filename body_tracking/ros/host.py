@@ -206,6 +206,7 @@ class StageNode(GraphNode):
     def close(self) -> None:
         try:
             self.stage.save()
+            self.log_events()
         except BodyTrackingError as error:
             self.get_logger().error(str(error))
 

@@ -41,6 +41,21 @@ def said(folder: Path) -> dict[str, str]:
     return {name: text for name, text in texts.items() if any("[INFO]" not in line for line in text.splitlines())}
 
 
+def test_a_page_in_the_background_of_a_script_ends_by_ctrl_c(tmp_path: Path) -> None:
+    """Shells let such jobs ignore SIGINT."""
+    file = tmp_path / "page.yaml"
+    file.write_text("viewer: {ros__parameters: {port: 0}}")
+    code = "import signal, sys; signal.signal(signal.SIGINT, signal.SIG_IGN); from body_tracking.cli import main; "
+    command = [sys.executable, "-c", f"{code}sys.exit(main())", "view", "--params-file", str(file)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment(), cwd=tmp_path) as page:
+        try:
+            assert page.stdout is not None and "open http" in page.stdout.readline()
+            page.send_signal(signal.SIGINT)
+            assert page.wait(timeout=60.0) == 0
+        finally:
+            page.kill()
+
+
 @pytest.mark.parametrize("after", some([0.05, 0.0, 0.3, 0.7, 1.2, 2.0], 3))
 def test_starting_node_ends_at_once(started: list[subprocess.Popen[bytes]], tmp_path: Path, after: float) -> None:
     time.sleep(after)

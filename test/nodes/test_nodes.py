@@ -430,6 +430,7 @@ def test_calibration_is_saved_and_loaded(tmp_path: Path) -> None:
         # The player has sent everything, the calibration may still be at work on it.
         assert running.until(lambda: any("kinect2" in pose.child_frame_id for pose in poses), timeout=30.0)
         assert stop(running.processes["calibration"]) == 0
+        assert running.log("calibration").count(f"{file}: written") == 1
     result = load(file)
     assert result.reference == "kinect1"
     assert set(result.poses) == {"kinect1", "kinect2"}
@@ -439,6 +440,7 @@ def test_calibration_is_saved_and_loaded(tmp_path: Path) -> None:
         clocks = running.collect(TimeReference, graph.CALIBRATION_CLOCK, LATCHED)
         come = running.until(lambda: len({pose.child_frame_id for pose in poses}) == 2 and clocks, timeout=60.0)
         assert come, (poses, clocks, running.log("calibration"), running.diagnostics)
+        assert running.until(lambda: f"{file}: loaded" in running.log("calibration"))
         loaded = {pose.child_frame_id: pose.transform.translation for pose in poses}
         assert loaded["kinect2_optical_frame"].x == pytest.approx(result.poses["kinect2"].translation[0])
         assert clocks[0].source == "kinect2"
