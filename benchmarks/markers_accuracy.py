@@ -29,6 +29,7 @@ import cv2
 import markers_lab as lab
 import numpy as np
 from scipy.spatial.transform import Rotation
+from target_points import TARGET_POINTS, rotation_error
 
 from body_tracking.calibration.rigid import rigid_registration
 from body_tracking.core import so3
@@ -51,7 +52,6 @@ from body_tracking.markers.targets import Target
 from body_tracking.markers.triangulation import triangulate
 from body_tracking.simulation.marker_bags import COLUMNS, ROWS, SQUARE, board_images
 from body_tracking.simulation.marker_scene import DIAMETER, make_targets, stereo_rig
-from body_tracking.simulation.target_points import TARGET_POINTS, rotation_error
 
 DISTANCES = (0.5, 0.6, 0.7, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0)
 FLOOR_BAR = 1.10

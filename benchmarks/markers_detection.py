@@ -17,10 +17,7 @@ from dataclasses import dataclass
 import common
 import cv2
 import numpy as np
-
-from body_tracking.markers.detection import detect
-from body_tracking.markers.rendering import Rendered, Sensor
-from body_tracking.simulation.ball_images import (
+from ball_images import (
     apart,
     cut_by_border,
     found,
@@ -28,6 +25,9 @@ from body_tracking.simulation.ball_images import (
     overlapping,
     three_touching,
 )
+
+from body_tracking.markers.detection import detect
+from body_tracking.markers.rendering import Rendered, Sensor
 
 DEPTHS = (0.6, 1.0, 1.5, 2.0, 2.5)
 USUAL = Sensor()

@@ -30,6 +30,7 @@ from pathlib import Path
 import common
 import numpy as np
 from imu_pendulum import LINKS, SETTLING_S, fit, one_offset, record
+from worn_targets import ARM, wear_targets, write_targets
 
 from body_tracking.core import so3
 from body_tracking.core.orientation import SEGMENT_NUMBER
@@ -45,7 +46,6 @@ from body_tracking.recording.replay import ReplaySettings, replay
 from body_tracking.simulation.bags import write_bag
 from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.scene import Setup, simulate
-from body_tracking.simulation.worn_targets import ARM, wear_targets, write_targets
 
 OFFSET, DRIFT = 1.7, 50e-6
 SECONDS = 40.0

@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Image
+from target_points import random_rotation
 
 from body_tracking.core.parameters import check_all
 from body_tracking.core.qos import Qos
@@ -50,7 +51,6 @@ from body_tracking.pipeline.stage import Now, Stage
 from body_tracking.recording.rosbag2 import BAG_WIRE
 from body_tracking.simulation.marker_bags import SEED, images
 from body_tracking.simulation.marker_scene import MarkerScene, make_targets, marker_scene, stereo_rig
-from body_tracking.simulation.target_points import random_rotation
 from body_tracking.systems import options_of
 
 RATE, FRAMES = 60.0, 60

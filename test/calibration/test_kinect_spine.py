@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from kinect_vs_vicon import kinect_skeletons
 from scipy.spatial.transform import Rotation
 
 from body_tracking.calibration.joint_centres import body_axes
@@ -17,9 +17,6 @@ from body_tracking.kinematics.conventions import angles_of
 from body_tracking.kinematics.positional import positional_angles
 from draws import some
 from walkers import performed
-
-sys.path.append(str(Path(__file__).resolve().parents[2] / "benchmarks"))
-from kinect_vs_vicon import kinect_skeletons
 
 BODY = performed("reaching", np.array([6.0]))[0]
 MOVED = [Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER, Joint.NECK, Joint.HEAD]

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.signal import lfilter
+from worn_targets import ARM, WornTargets, wear_targets
 
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.joint_angles import JointAngles
@@ -24,7 +25,6 @@ from body_tracking.pipeline import graph
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter
 from body_tracking.simulation.people import MODEL, Person
 from body_tracking.simulation.repertoire import make_movement
-from body_tracking.simulation.worn_targets import ARM, WornTargets, wear_targets
 
 OFFSET, DRIFT = 1.7, 50e-6
 """Of the marker system's clock at the estimate's time 0."""

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from known_errors import NOISY, START_NS, Scene, correlated_noise, scene
+from worn_targets import write_targets
 
 from body_tracking.cli import main
 from body_tracking.core.message_types import JOINT_STATE
@@ -21,7 +22,6 @@ from body_tracking.messages.model import estimate_to_joint_state
 from body_tracking.pipeline import graph
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter
 from body_tracking.simulation.people import MODEL
-from body_tracking.simulation.worn_targets import write_targets
 
 ELBOW = "elbow_flexion_left"
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from known_errors import DRIFT, OFFSET, Scene, scene
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
+from worn_targets import ARM, segment_rotations
 
 from body_tracking.core import so3
 from body_tracking.core.skeleton import FloatArray
@@ -25,7 +26,6 @@ from body_tracking.evaluation.hand_eye import (
 from body_tracking.inertial.clock import clock_offset, turning
 from body_tracking.inertial.imu_csv import ImuCsvRecording
 from body_tracking.inertial.imu_orientation import OrientationEstimator
-from body_tracking.simulation.worn_targets import ARM, segment_rotations
 
 NEAR = np.array([OFFSET + 0.01, 0.0])
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from known_errors import DRIFT, OFFSET, START_NS, Scene, scene
+from worn_targets import ARM, write_targets
 
 from body_tracking.cli import main
 from body_tracking.core.message_types import JOINT_STATE
@@ -23,7 +24,6 @@ from body_tracking.kinematics.conventions import CONVENTIONS
 from body_tracking.pipeline import graph
 from body_tracking.recording.rosbag2 import BagWriter
 from body_tracking.simulation.people import MODEL
-from body_tracking.simulation.worn_targets import ARM, write_targets
 from draws import draws, some
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+import time_warp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.evaluation.metrics import sample
 from draws import draws
-
-sys.path.append(str(Path(__file__).resolve().parents[2] / "benchmarks"))
-import time_warp
 
 
 def movement(times: FloatArray) -> FloatArray:

@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from body_tracking.core.compiled import LOOPS
-from body_tracking.markers.detection import DetectionSettings, ImageError, detect, prepare
-from body_tracking.markers.rendering import Sensor, render
-from body_tracking.simulation.ball_images import (
+from ball_images import (
     CAMERA,
     DIAMETER,
     HERE,
@@ -20,6 +16,10 @@ from body_tracking.simulation.ball_images import (
     overlapping,
     three_touching,
 )
+
+from body_tracking.core.compiled import LOOPS
+from body_tracking.markers.detection import DetectionSettings, ImageError, detect, prepare
+from body_tracking.markers.rendering import Sensor, render
 from draws import draws, some
 
 

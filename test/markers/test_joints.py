@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from marker_people import columns, measured, pair, pose_covariances, random_posture
+from markers_functional import EPICONDYLES, PELVIS, SHANK, THIGH, axis_angle, cluster, markers
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -27,9 +27,6 @@ from body_tracking.markers.joints import (
 from body_tracking.markers.observations import TargetPose
 from body_tracking.markers.pose_table import PoseTableError
 from draws import draws, some
-
-sys.path.append(str(Path(__file__).resolve().parents[2] / "benchmarks"))
-from markers_functional import EPICONDYLES, PELVIS, SHANK, THIGH, axis_angle, cluster, markers
 
 FITS = {
     JointKind.BALL: fit_ball_joint,

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rigs import images, rig
+from target_points import TARGET_POINTS, measure, random_rotation
 
 from body_tracking import cli
 from body_tracking.core.message_types import POINT_CLOUD
@@ -24,7 +25,6 @@ from body_tracking.recording.rosbag2 import BAG_WIRE, BagWriter
 from body_tracking.simulation.marker_bags import WAND as RENDERED_WAND
 from body_tracking.simulation.marker_bags import write_wand
 from body_tracking.simulation.marker_scene import DIAMETER, stereo_rig
-from body_tracking.simulation.target_points import TARGET_POINTS, measure, random_rotation
 
 WAND = (0.0, 0.1, 0.3)
 START_NS, PERIOD_NS = 1_750_000_000_000_000_000, 16_666_667

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from rigs import rig
 from scipy.spatial.transform import Rotation
+from target_points import measure
 
 from body_tracking.core.message_types import TF
 from body_tracking.core.parameters import check_all
@@ -23,7 +24,6 @@ from body_tracking.pipeline import graph
 from body_tracking.pipeline.stage import Now, Stage
 from body_tracking.recording.rosbag2 import BAG_WIRE, deserialize
 from body_tracking.simulation.marker_scene import MarkerScene, marker_scene
-from body_tracking.simulation.target_points import measure
 
 NOW = Now(1_750_000_000_000_000_000, 5)
 

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from target_points import TARGET_POINTS, measure, random_rotation, rotation_error
 
 from body_tracking.markers import pose
 from body_tracking.markers.observations import Points
 from body_tracking.markers.pose import PoseError, fit_pose, umeyama
 from body_tracking.markers.targets import Target
-from body_tracking.simulation.target_points import TARGET_POINTS, measure, random_rotation, rotation_error
 from draws import draws
 
 TARGET = Target("target", TARGET_POINTS, np.zeros((15, 15)))

@@ -8,12 +8,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-
-from body_tracking.markers.depth_first import gaschler_depth_first
-from body_tracking.markers.observations import Points
-from body_tracking.markers.recognition import Recogniser, RecognitionError
-from body_tracking.markers.search import GATE, Deadline, Shape, near_pairs
-from body_tracking.simulation.target_points import (
+from target_points import (
     measure,
     random_rotation,
     random_targets,
@@ -21,6 +16,11 @@ from body_tracking.simulation.target_points import (
     scene,
     target_set,
 )
+
+from body_tracking.markers.depth_first import gaschler_depth_first
+from body_tracking.markers.observations import Points
+from body_tracking.markers.recognition import Recogniser, RecognitionError
+from body_tracking.markers.search import GATE, Deadline, Shape, near_pairs
 from draws import draws
 
 

@@ -7,12 +7,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from ball_images import CAMERA, DIAMETER, HERE, NOISELESS, apart, at, half_hidden, overlapping
 
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.markers.distinct import check_distinct
 from body_tracking.markers.rendering import Capsule, RenderingError, Sensor, render, render_chessboard
 from body_tracking.markers.spheres import SphereError, outlines, polygon_centroids, sphere_centre_correction
-from body_tracking.simulation.ball_images import CAMERA, DIAMETER, HERE, NOISELESS, apart, at, half_hidden, overlapping
 from body_tracking.simulation.marker_scene import EXTENT, make_targets
 from draws import draws
 

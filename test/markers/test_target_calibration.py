@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from target_points import TARGET_POINTS, measure, random_rotation, random_targets, scene
 
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.markers.distinct import TargetsAlikeError, check_distinct
@@ -19,7 +20,6 @@ from body_tracking.markers.target_calibration import (
 )
 from body_tracking.markers.targets import Target
 from body_tracking.markers.targets_file import TargetsFileError, load_targets, save_targets
-from body_tracking.simulation.target_points import TARGET_POINTS, measure, random_rotation, random_targets, scene
 from draws import draws
 
 

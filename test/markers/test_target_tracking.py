@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from target_points import measure, moving, random_rotation, rotation_error, target_set
 
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.markers.observations import Points
 from body_tracking.markers.tracking import Motion, TargetTracker, TrackingError
-from body_tracking.simulation.target_points import measure, moving, random_rotation, rotation_error, target_set
 from draws import draws
 
 

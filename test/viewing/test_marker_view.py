@@ -11,6 +11,8 @@ import pytest
 
 pytest.importorskip("viser", reason="viser is not installed")
 
+from target_points import measure
+
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.markers import setup
 from body_tracking.markers.chain_files import save_chain
@@ -21,7 +23,6 @@ from body_tracking.markers.targets_file import save_targets
 from body_tracking.messages.cdr import stamp_of
 from body_tracking.recording.rosbag2 import BAG_WIRE
 from body_tracking.simulation.marker_scene import MarkerScene, marker_scene
-from body_tracking.simulation.target_points import measure
 from body_tracking.viewing.marker_view import MarkerView
 from body_tracking.viewing.page import Page
 from body_tracking.viewing.snapshot import Seen, Snapshot
