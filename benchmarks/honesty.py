@@ -21,22 +21,15 @@ from typing import Any
 import common
 import numpy as np
 from numpy.typing import NDArray
+from random_people import MeasurementErrors, RandomPerson, capture_times, draw_dropouts, observe, truth_of
 from scipy.stats import chi2
 
 from body_tracking.core.skeleton import N_JOINTS, FloatArray
 from body_tracking.filters.ekf.filter import ExtendedKalmanFilter
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.kinematics.upper_body import UNOBSERVED
-from body_tracking.simulation.random_people import (
-    MODEL,
-    MeasurementErrors,
-    RandomMotion,
-    RandomPerson,
-    capture_times,
-    draw_dropouts,
-    observe,
-    truth_of,
-)
+from body_tracking.simulation.people import MODEL
+from body_tracking.simulation.random_motion import RandomMotion
 
 NAMES = MODEL.coordinate_names
 OBSERVED = np.array([number for number, name in enumerate(NAMES) if name not in UNOBSERVED])

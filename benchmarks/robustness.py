@@ -30,19 +30,10 @@ from typing import Any
 import common
 import numpy as np
 from honesty import NAMES, OBSERVED, Settings, all_runs, new_filter
-
-from body_tracking.core.skeleton import BoolArray, FloatArray
-from body_tracking.filters.ekf.filter import ExtendedKalmanFilter
-from body_tracking.filters.ekf.parameters import EkfParameters
-from body_tracking.kinematics.ranges import Ranges
-from body_tracking.kinematics.upper_body import UNOBSERVED
-from body_tracking.simulation.random_people import (
-    MODEL,
-    POSTURES,
+from random_people import (
     Dropout,
     MeasurementErrors,
     Observation,
-    RandomMotion,
     RandomPerson,
     Truth,
     capture_times,
@@ -50,6 +41,14 @@ from body_tracking.simulation.random_people import (
     observe,
     truth_of,
 )
+
+from body_tracking.core.skeleton import BoolArray, FloatArray
+from body_tracking.filters.ekf.filter import ExtendedKalmanFilter
+from body_tracking.filters.ekf.parameters import EkfParameters
+from body_tracking.kinematics.ranges import Ranges
+from body_tracking.kinematics.upper_body import UNOBSERVED
+from body_tracking.simulation.people import MODEL
+from body_tracking.simulation.random_motion import POSTURES, RandomMotion
 
 GOOD = 2.0
 """Seconds of good data at the end."""

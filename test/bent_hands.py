@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from body_tracking.core.skeleton import FloatArray, IntArray
-from body_tracking.simulation.random_people import MODEL
+from body_tracking.simulation.people import MODEL
 
 
 def hand_columns(side: str) -> IntArray:

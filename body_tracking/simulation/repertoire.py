@@ -29,7 +29,7 @@ from body_tracking.simulation.postures import (
     configuration,
     posture,
 )
-from body_tracking.simulation.random_people import RandomMotion
+from body_tracking.simulation.random_motion import RandomMotion
 
 TPOSE_S = 3.0
 """Seconds of T-pose at the beginning."""

@@ -9,6 +9,19 @@ import numpy as np
 import pytest
 from estimates import assert_same, known
 from numpy.testing import assert_allclose, assert_array_equal
+from random_people import (
+    ARMS,
+    EVERYTHING,
+    START_NS,
+    Dropout,
+    MeasurementErrors,
+    Observation,
+    RandomPerson,
+    Truth,
+    capture_times,
+    observe,
+    truth_of,
+)
 from scipy.stats import chi2
 
 from body_tracking.core.measurement import BASE_STDDEV, joint_correlation
@@ -30,21 +43,8 @@ from body_tracking.kinematics.conventions import angles_of
 from body_tracking.kinematics.posture import PosturePrior
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UNOBSERVED
-from body_tracking.simulation.random_people import (
-    ARMS,
-    EVERYTHING,
-    MODEL,
-    START_NS,
-    Dropout,
-    MeasurementErrors,
-    Observation,
-    RandomMotion,
-    RandomPerson,
-    Truth,
-    capture_times,
-    observe,
-    truth_of,
-)
+from body_tracking.simulation.people import MODEL
+from body_tracking.simulation.random_motion import RandomMotion
 from draws import draws, some
 
 POINTS = MODEL.joints

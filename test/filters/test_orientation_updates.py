@@ -11,6 +11,7 @@ from estimates import assert_same, known
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
+from random_people import START_NS, Dropout, MeasurementErrors, RandomPerson, Truth, capture_times, observe, truth_of
 from scipy.linalg import expm
 from scipy.signal import lfilter
 from scipy.stats import binom
@@ -28,18 +29,8 @@ from body_tracking.filters.ekf.sources import PER_SOURCE, Sources
 from body_tracking.kinematics.posture import STDDEV, PosturePrior
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UNOBSERVED
-from body_tracking.simulation.random_people import (
-    MODEL,
-    START_NS,
-    Dropout,
-    MeasurementErrors,
-    RandomMotion,
-    RandomPerson,
-    Truth,
-    capture_times,
-    observe,
-    truth_of,
-)
+from body_tracking.simulation.people import MODEL
+from body_tracking.simulation.random_motion import RandomMotion
 from draws import draws, some
 
 NAMES = MODEL.coordinate_names

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from random_people import START_NS, MeasurementErrors, RandomPerson, capture_times, observe, truth_of
 
 from body_tracking.core.body_model import SEGMENTS
 from body_tracking.core.orientation import SegmentOrientation
@@ -18,16 +19,8 @@ from body_tracking.filters.people import PeopleFilter, filter_of
 from body_tracking.filters.person import FilterSettings, PersonFilter
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.people import ALL, PeopleParameters
-from body_tracking.simulation.random_people import (
-    MODEL,
-    START_NS,
-    MeasurementErrors,
-    RandomMotion,
-    RandomPerson,
-    capture_times,
-    observe,
-    truth_of,
-)
+from body_tracking.simulation.people import MODEL
+from body_tracking.simulation.random_motion import RandomMotion
 from draws import some
 
 SENSORS = ("kinect1", "kinect2")

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from random_people import MeasurementErrors, RandomPerson, capture_times, observe, truth_of
 from scipy.stats import chi2
 
 from body_tracking.core.parameters import check_all
@@ -26,15 +27,8 @@ from body_tracking.kinematics.upper_body import UNOBSERVED
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.people import ALL, PeopleParameters
 from body_tracking.pipeline.stage import Now
-from body_tracking.simulation.random_people import (
-    MODEL,
-    MeasurementErrors,
-    RandomMotion,
-    RandomPerson,
-    capture_times,
-    observe,
-    truth_of,
-)
+from body_tracking.simulation.people import MODEL
+from body_tracking.simulation.random_motion import RandomMotion
 from draws import draws
 from walkers import TRACKED
 

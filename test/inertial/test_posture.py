@@ -10,7 +10,7 @@ from body_tracking.core import so3
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.inertial.posture import OrientationKinematics
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.simulation.random_people import RandomMotion
+from body_tracking.simulation.random_motion import RandomMotion
 from draws import draws
 
 MODEL = UpperBody()

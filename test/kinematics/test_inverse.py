@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from random_people import ARMS, RandomPerson
 
 from bent_hands import hand_columns, turned_over
 from body_tracking.core.body_model import ModelError
@@ -12,7 +13,8 @@ from body_tracking.core.skeleton import BONES as SKELETON_BONES
 from body_tracking.core.skeleton import BoolArray, FloatArray, Joint
 from body_tracking.kinematics.inverse import InverseKinematics
 from body_tracking.kinematics.ranges import Ranges
-from body_tracking.simulation.random_people import ARMS, MODEL, RandomMotion, RandomPerson
+from body_tracking.simulation.people import MODEL
+from body_tracking.simulation.random_motion import RandomMotion
 from draws import draws, some
 
 INVERSE = InverseKinematics(MODEL)

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
+from random_people import RandomPerson, capture_times, truth_of
 from scipy.spatial.transform import Rotation
 
 from body_tracking.core.measurement import BASE_STDDEV
@@ -21,7 +22,8 @@ from body_tracking.pipeline.graph import FUSED
 from body_tracking.recording.importer import import_files
 from body_tracking.recording.replay import ReplaySettings, replay
 from body_tracking.recording.rosbag2 import BagReader
-from body_tracking.simulation.random_people import MODEL, RandomMotion, RandomPerson, capture_times, truth_of
+from body_tracking.simulation.people import MODEL
+from body_tracking.simulation.random_motion import RandomMotion
 from draws import draws
 
 POINTS = MODEL.joints

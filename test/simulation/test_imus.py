@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
+from random_people import RandomPerson
 from scipy.integrate import cumulative_trapezoid
 
 from body_tracking.core import so3
@@ -25,7 +26,8 @@ from body_tracking.inertial.simulated_errors import (
 )
 from body_tracking.inertial.surroundings import Iron, Surroundings
 from body_tracking.kinematics.trajectories import minimum_jerk
-from body_tracking.simulation.random_people import MODEL, RandomMotion, RandomPerson
+from body_tracking.simulation.people import MODEL
+from body_tracking.simulation.random_motion import RandomMotion
 from draws import draws, some
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -7,18 +7,12 @@ from functools import cache
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-
-from body_tracking.core.skeleton import NANOSECONDS, Joint, TrackingState
-from body_tracking.kinematics.ranges import Ranges
-from body_tracking.simulation.random_people import (
+from random_people import (
     ARMS,
     EVERYTHING,
-    MODEL,
-    POSTURES,
     START_NS,
     Dropout,
     MeasurementErrors,
-    RandomMotion,
     RandomPerson,
     Truth,
     capture_times,
@@ -26,6 +20,11 @@ from body_tracking.simulation.random_people import (
     observe,
     truth_of,
 )
+
+from body_tracking.core.skeleton import NANOSECONDS, Joint, TrackingState
+from body_tracking.kinematics.ranges import Ranges
+from body_tracking.simulation.people import MODEL
+from body_tracking.simulation.random_motion import POSTURES, RandomMotion
 from draws import draws
 
 POINT = {Joint(joint): number for number, joint in enumerate(MODEL.joints)}
