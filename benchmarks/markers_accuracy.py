@@ -29,7 +29,7 @@ import cv2
 import markers_lab as lab
 import numpy as np
 from scipy.spatial.transform import Rotation
-from target_points import TARGET_POINTS, rotation_error
+from target_points import TARGET_POINTS, fit_pose, rotation_error
 
 from body_tracking.calibration.rigid import rigid_registration
 from body_tracking.core import so3
@@ -44,7 +44,7 @@ from body_tracking.markers.detection import detect
 from body_tracking.markers.joint_model import SIZE
 from body_tracking.markers.joint_tree import Posture, Tree, differentiate, place
 from body_tracking.markers.joints import Verdict
-from body_tracking.markers.pose import fit_pose, umeyama
+from body_tracking.markers.pose import umeyama
 from body_tracking.markers.recognition import Recogniser
 from body_tracking.markers.rendering import Sensor, render
 from body_tracking.markers.rig import Rig

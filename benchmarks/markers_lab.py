@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from target_points import fit_pose
 
 from body_tracking.core import so3
 from body_tracking.core.skeleton import FloatArray
@@ -19,7 +20,7 @@ from body_tracking.markers.camera_calibration import calibrate_cameras
 from body_tracking.markers.joint_model import SIZE, Joint, JointKind, axis_frame, conventional
 from body_tracking.markers.joint_tree import Posture, Tree, tree_of
 from body_tracking.markers.observations import ImageBalls, Points, TargetPose
-from body_tracking.markers.pose import fit_pose, umeyama
+from body_tracking.markers.pose import umeyama
 from body_tracking.markers.rig import Rig
 from body_tracking.markers.target_calibration import calibrate_target
 from body_tracking.markers.targets import Target

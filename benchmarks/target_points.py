@@ -13,9 +13,10 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from body_tracking.core.skeleton import FloatArray
+from body_tracking.core.skeleton import FloatArray, IntArray
 from body_tracking.markers.distinct import TargetsAlikeError, check_distinct
-from body_tracking.markers.observations import Points
+from body_tracking.markers.observations import Points, TargetPose
+from body_tracking.markers.pose import balls_covariance, maximum_likelihood
 from body_tracking.markers.targets import Target
 
 PIXEL_NOISE = 0.1
@@ -161,6 +162,24 @@ def moving(
             if owners[source][0] >= 0:
                 assignments[owners[source][0]][owners[source][1]] = row
         yield round(frame / 60.0 * 1e9), np.array(rows)[order], now, assignments
+
+
+def fit_pose(target: Target, points: Points, assignment: IntArray) -> TargetPose:
+    """The maximum likelihood pose of a target from the points (k,) of its balls, -1 if unseen."""
+    seen = np.flatnonzero(assignment >= 0)
+    chosen = assignment[seen]
+    model, measured, noise = target.points[seen], points.positions[chosen], points.covariance[chosen]
+    fits = maximum_likelihood(model[None], measured[None], noise[None], balls_covariance(target, seen)[None])
+    return TargetPose(
+        target.name,
+        points.stamp_ns,
+        points.frame_id,
+        fits.rotation[0],
+        fits.translation[0],
+        fits.covariance[0],
+        assignment,
+        float(fits.residual[0]),
+    )
 
 
 def rotation_error(first: FloatArray, second: FloatArray) -> FloatArray:

@@ -1,20 +1,13 @@
-"""Quality of a camera calibration: Gaschler's table 4.1, and errors of triangulated edges of a board's squares."""
+"""Quality of a camera calibration: Gaschler's table 4.1."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import numpy as np
 
 from body_tracking.core import so3
-from body_tracking.core.skeleton import FloatArray
 from body_tracking.markers import projection
-from body_tracking.markers.boards import Chessboard
-from body_tracking.markers.bundle import Corners
-from body_tracking.markers.bundle_points import Sightings
-from body_tracking.markers.camera_calibration import RADIAL, CalibrationError, CameraCalibration, calibrate_cameras
+from body_tracking.markers.camera_calibration import CameraCalibration
 from body_tracking.markers.rig import LENS, Rig
-from body_tracking.markers.wand import intersect
 
 
 def table(calibration: CameraCalibration) -> str:
@@ -58,45 +51,3 @@ def _pose(rig: Rig, index: int) -> list[str]:
         f"  t           [{shift[0] * 1e3:.2f} {shift[1] * 1e3:.2f} {shift[2] * 1e3:.2f}] mm, "
         f"{distance * 1e3:.2f} +- {distance_deviation * 1e3:.2f} mm",
     ]
-
-
-def edge_errors(rig: Rig, board: Chessboard, corners: Corners) -> FloatArray:
-    """Relative errors (n,) of the triangulated edges of a board's squares, from all cameras that see both ends.
-
-    Args:
-        rig: the cameras.
-        board: the board.
-        corners: of this board.
-    """
-    index = np.rint(corners.board[:, :2] / board.square).astype(np.intp)
-    numbers = index[:, 0] + board.columns * index[:, 1]
-    points = intersect(
-        rig, Sightings(corners.cameras, corners.views, numbers, corners.pixels), board.columns * board.rows
-    )
-    edges = board.edges()
-    known = np.asarray(points.any(axis=-1))
-    lengths = np.linalg.norm(points[:, edges[:, 1]] - points[:, edges[:, 0]], axis=-1)
-    errors: FloatArray = (lengths / board.square - 1.0)[known[:, edges].all(axis=-1)]
-    return errors
-
-
-def left_out_edge_errors(
-    frames: Sequence[str],
-    sizes: Sequence[tuple[int, int]],
-    board: Chessboard,
-    corners: Corners,
-    coefficients: tuple[int, ...] = RADIAL,
-) -> FloatArray:
-    """As :func:`edge_errors`, but each view by the calibration from all other views (leave-one-out).
-
-    Raises:
-        CalibrationError: the cameras cannot be calibrated without one of the views.
-    """
-    errors = []
-    for view in np.unique(corners.views):
-        here = corners.views == view
-        rig = calibrate_cameras(frames, sizes, corners.where(~here), coefficients).rig
-        errors.append(edge_errors(rig, board, corners.where(here)))
-    if not errors:
-        raise CalibrationError("no boards")
-    return np.concatenate(errors)

@@ -1,4 +1,4 @@
-"""The pose of a target from points assigned to its balls.
+"""The poses of targets from points assigned to their balls.
 
 A closed form (Umeyama 1991; Gaschler 2011, section 3.3.3) initialises the maximum likelihood estimate by Gauss-Newton:
 the standard deviation of a triangulated point is several times larger along the line of sight than across, which
@@ -15,25 +15,15 @@ import numpy as np
 
 from body_tracking.core.compiled import compiled
 from body_tracking.core.compiled_so3 import turned
-from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import FloatArray, IntArray
-from body_tracking.markers.observations import Points, TargetPose
 from body_tracking.markers.targets import Target
 
 FEWEST: Final = 3
 """Least number of points of a pose; they must not be collinear."""
 
-_FLAT: Final = 1e-4
-"""Ratio of the widths of a set of points, below which they are collinear, whatever their noise."""
-_MAX_ANGLE_STDDEV: Final = 0.5
-"""Radians: above it the rotation counts as undetermined, because the linearised covariance is invalid."""
 _ITERATIONS: Final = 10
 _CONVERGED: Final = 1e-7
 """Largest step at convergence, metres and radians."""
-
-
-class PoseError(BodyTrackingError):
-    """Raised for points that do not determine the pose of the target."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,65 +159,8 @@ def _maximised(
     return rotations, translations, covariances, chi_squares, residuals
 
 
-def fit_pose(target: Target, points: Points, assignment: IntArray) -> TargetPose:
-    """The maximum likelihood pose of a target with known assignment of points to balls.
-
-    Weights are by the covariances of the points plus that of the target's own points.
-
-    Args:
-        target: with k balls.
-        points: one frame.
-        assignment: (k,) index of each ball among the points, -1 if unseen.
-
-    Raises:
-        PoseError: fewer than 3 balls, an index out of range or used twice, numbers that are not finite, a covariance
-            that is not positive definite, or balls so nearly collinear that the rotation about their line is
-            undetermined.
-    """
-    assignment = np.asarray(assignment)
-    where = f"target {target.name} at {points.stamp_ns} ns"
-    if assignment.shape != (len(target.points),) or not np.issubdtype(assignment.dtype, np.integer):
-        raise PoseError(f"{where}: assignment {assignment.shape} of {len(target.points)} balls")
-    seen = np.flatnonzero(assignment >= 0)
-    chosen = assignment[seen]
-    if len(seen) < FEWEST:
-        raise PoseError(f"{where}: {len(seen)} balls, at least {FEWEST} are needed")
-    if assignment.min() < -1 or chosen.max() >= len(points.positions) or len(set(chosen.tolist())) < len(chosen):
-        raise PoseError(f"{where}: points {assignment.tolist()} of {len(points.positions)}, each once at most")
-    model, measured, noise = target.points[seen], points.positions[chosen], points.covariance[chosen]
-    if not (np.isfinite(model).all() and np.isfinite(measured).all() and np.isfinite(noise).all()):
-        raise PoseError(f"{where}: a point or a covariance is not finite")
-    if np.linalg.eigvalsh(noise)[:, 0].min() <= 0.0:
-        raise PoseError(f"{where}: a point's covariance is not positive definite")
-    if _on_one_line(model) or _on_one_line(measured):
-        raise PoseError(f"{where}: the balls lie on one line, the rotation about it is free")
-    fits = maximum_likelihood(model[None], measured[None], noise[None], shape_covariance(target, seen))
-    if not np.isfinite(fits.covariance).all() or fits.covariance[0, 3:, 3:].trace() > _MAX_ANGLE_STDDEV**2:
-        raise PoseError(f"{where}: the balls lie on one line within their noise, the rotation about it is free")
-    return TargetPose(
-        target.name,
-        points.stamp_ns,
-        points.frame_id,
-        fits.rotation[0],
-        fits.translation[0],
-        fits.covariance[0],
-        assignment.astype(np.int64),
-        float(fits.residual[0]),
-    )
-
-
-def shape_covariance(target: Target, balls: IntArray) -> FloatArray | None:
-    """(1, 3m, 3m) covariance of these balls of a target; None for an exactly known target."""
-    return balls_covariance(target, balls)[None] if target.covariance.any() else None
-
-
 def balls_covariance(target: Target, balls: IntArray) -> FloatArray:
     """(3m, 3m) covariance of these balls of a target."""
     rows = (3 * balls[:, None] + np.arange(3)).ravel()
     part: FloatArray = target.covariance[np.ix_(rows, rows)]
     return part
-
-
-def _on_one_line(points: FloatArray) -> bool:
-    widths = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(widths[1] <= _FLAT * widths[0])

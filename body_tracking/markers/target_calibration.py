@@ -1,7 +1,7 @@
-"""Geometry of a target from many views (Gaschler 2011, section 4.2) or from a drawing.
+"""Geometry of a target from many views (Gaschler 2011, section 4.2).
 
-The origin of a target's frame is the centroid of its balls. From views, x points from ball 0 to ball 1, and y from that
-line towards the first further ball that is not near it; from a drawing, the axes are the drawing's.
+The origin of a target's frame is the centroid of its balls; x points from ball 0 to ball 1, and y from that line
+towards the first further ball that is not near it.
 """
 
 from __future__ import annotations
@@ -127,27 +127,6 @@ def calibrate_target(
     turn = np.kron(np.eye(balls), axes)
     target = Target(name, shape @ axes.T, turn @ covariance_of_shape @ turn.T, diameter)
     return TargetCalibration(target, used, noise, 1.0 if covariance is None else reduced)
-
-
-def known_target(name: str, points: FloatArray, stddev: float = 0.0, diameter: float = 0.0) -> Target:
-    """A target of known geometry, as from a drawing; its origin moves to the centroid of the balls.
-
-    Args:
-        name: of the target.
-        points: (k, 3) centres of the balls, metres; three or more, not collinear.
-        stddev: manufacturing standard deviation of each coordinate, metres.
-        diameter: of the balls, metres.
-
-    Raises:
-        TargetCalibrationError: wrong shapes, numbers that are not finite, collinear balls.
-    """
-    points = np.array(points, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or len(points) < FEWEST or not np.isfinite(points).all():
-        raise TargetCalibrationError(f"target {name}: points {points.shape}, expected (k, 3), k 3 or more, all finite")
-    if not (np.isfinite(stddev) and stddev >= 0.0 and np.isfinite(diameter) and diameter >= 0.0):
-        raise TargetCalibrationError(f"target {name}: deviation {stddev:g} m and diameter {diameter:g} m")
-    _check_spread(name, points - points.mean(axis=0))
-    return Target(name, points - points.mean(axis=0), stddev**2 * np.eye(3 * len(points)), diameter)
 
 
 def ordered_views(frames: Sequence[Points], balls: IntArray, first: int = 0) -> tuple[FloatArray, FloatArray]:

@@ -15,7 +15,6 @@ from body_tracking.markers.pose import umeyama
 from body_tracking.markers.target_calibration import (
     TargetCalibrationError,
     calibrate_target,
-    known_target,
     ordered_views,
 )
 from body_tracking.markers.targets import Target
@@ -118,15 +117,10 @@ def test_calibration_refuses_what_determines_no_target() -> None:
     ):
         with pytest.raises(TargetCalibrationError, match=text):
             calibrate_target("target", given, noise)
-    for points, text in ((line, "line"), (line[:2], "expected"), (line * np.nan, "finite")):
-        with pytest.raises(TargetCalibrationError, match=text):
-            known_target("target", points)
 
 
-def test_known_target_has_its_origin_at_the_centroid() -> None:
-    target = known_target("target", TARGET_POINTS + 1.0, 1e-4, 0.012)
-    assert np.allclose(target.points, TARGET_POINTS, atol=1e-12)
-    assert np.allclose(target.covariance, 1e-8 * np.eye(15))
+def exact_target(name: str, points: FloatArray) -> Target:
+    return Target(name, points, np.zeros((points.size, points.size)))
 
 
 def test_targets_too_alike_are_named() -> None:
@@ -141,9 +135,9 @@ def test_targets_too_alike_are_named() -> None:
     for targets, text in (
         ([first, replace(first, name="copy", points=first.points[::-1] @ turn.T + 1.0)], "target0 and copy"),
         ([first, part], "target0 and part"),
-        ([known_target("equilateral", triangle)], "equilateral and itself"),
-        ([known_target("isosceles", isosceles)], "isosceles and itself"),
-        ([known_target("flat", flat), known_target("mirror", flat * np.array([-1.0, 1.0, 1.0]))], "flat and mirror"),
+        ([exact_target("equilateral", triangle)], "equilateral and itself"),
+        ([exact_target("isosceles", isosceles)], "isosceles and itself"),
+        ([exact_target("flat", flat), exact_target("mirror", flat * np.array([-1.0, 1.0, 1.0]))], "flat and mirror"),
     ):
         with pytest.raises(TargetsAlikeError, match=text):
             check_distinct(targets, 3e-4)
@@ -155,7 +149,7 @@ def test_targets_too_alike_are_named() -> None:
 
 def test_file_of_targets_keeps_every_number(tmp_path: Path) -> None:
     views = views_of(TARGET_POINTS, np.random.default_rng(47))
-    targets = [calibrate_target("one", *views, 0.012).target, known_target("two", TARGET_POINTS)]
+    targets = [calibrate_target("one", *views, 0.012).target, exact_target("two", TARGET_POINTS)]
     save_targets(targets, tmp_path / "new" / "targets.yaml")
     for before, after in zip(targets, load_targets(tmp_path / "new" / "targets.yaml"), strict=True):
         assert (before.name, before.diameter) == (after.name, after.diameter)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 from marker_people import random_joint, random_posture
+from target_points import fit_pose
 
 from body_tracking.core import so3
 from body_tracking.markers.chain import JointDescription, fit_chain
@@ -13,7 +14,6 @@ from body_tracking.markers.corrections import shape_effects
 from body_tracking.markers.joint_model import JointKind
 from body_tracking.markers.joint_tree import place, tree_of
 from body_tracking.markers.observations import Points
-from body_tracking.markers.pose import fit_pose
 from body_tracking.markers.projection import project
 from body_tracking.markers.targets import Target
 from body_tracking.simulation.marker_scene import make_targets, stereo_rig
