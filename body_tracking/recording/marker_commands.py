@@ -10,7 +10,6 @@ import argparse
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +32,7 @@ from body_tracking.markers.joint_model import JointKind
 from body_tracking.markers.observations import Points, TargetPose
 from body_tracking.markers.pose import FEWEST
 from body_tracking.markers.rig_storage import rig_in, save_rig
-from body_tracking.markers.stages import AnglesOfTargetsStage, DetectorStage, TrackerStage, TriangulationStage
+from body_tracking.markers.stages import DetectorStage, TrackerStage, TriangulationStage
 from body_tracking.markers.target_calibration import calibrate_target, ordered_views
 from body_tracking.markers.targets_file import load_targets, save_targets
 from body_tracking.markers.trajectories import TrajectoryError, is_trajectory_file, labels_in, read_trajectories
@@ -43,8 +42,9 @@ from body_tracking.pipeline.stage import Stage
 from body_tracking.pipeline.system import load
 from body_tracking.recording import marker_wand
 from body_tracking.recording.progress import Progress
+from body_tracking.recording.replay import ReplaySettings, replay
 from body_tracking.recording.rig import RigReader
-from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, BagWriter, check_new_bag
+from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, check_new_bag
 
 _VIEWS = 600
 """Approximate number of views of a labelled target: more views hardly add information."""
@@ -56,14 +56,6 @@ class MarkerCommandError(BodyTrackingError):
 
 
 # --- recordings
-
-
-@dataclass(frozen=True, slots=True)
-class Tracked:
-    """Output of the stages for a recording: messages by topic, and counters."""
-
-    messages: Mapping[str, list[bytes]]
-    counters: Mapping[str, int]
 
 
 def sources_of(bag: BagReader | RigReader, folder: Path) -> tuple[str, ...]:
@@ -82,68 +74,58 @@ def sources_of(bag: BagReader | RigReader, folder: Path) -> tuple[str, ...]:
 
 
 def track(
-    bag_path: Path,
-    folder: Path,
-    stages: Sequence[type[Stage]],
-    values: Mapping[str, Value],
-    sink: Callable[[str, bytes, int], None] = lambda topic, cdr, at_ns: None,
-) -> Tracked:
-    """Run stages over a recording.
+    bag_path: Path, folder: Path, stages: Sequence[type[Stage]], values: Mapping[str, Value]
+) -> dict[str, list[bytes]]:
+    """Messages of points and of the stages, by topic.
 
     Args:
         bag_path: with images, balls or points.
         folder: of the setup.
-        stages: in their order.
+        stages: in their order; a recording of points needs no cameras.
         values: parameters, for the stages that have them.
-        sink: called with topic, message and log time of each message from the recording and from the stages.
 
     Raises:
         BodyTrackingError: the recording or the setup cannot be used.
     """
     made: list[Stage] = []
-    with RigReader(bag_path) as bag:
-        topics = sources_of(bag, folder)
-    for stage in _after(topics, stages):
-        known = {item.name for item in stage.PARAMETERS}
-        given = {"setup": str(folder), **{name: value for name, value in values.items() if name in known}}
-        made.append(stage(check_all(stage.PARAMETERS, given)))
     found: dict[str, list[bytes]] = {}
 
     def keep(topic: str, cdr: bytes, at_ns: int) -> None:
         found.setdefault(topic, []).append(cdr)
-        sink(topic, cdr, at_ns)
 
-    runner = OfflineRunner(made, BAG_WIRE, keep)
     with RigReader(bag_path) as bag:
+        topics = sources_of(bag, folder)
+        for stage in stages:
+            if topics != (setup.POINTS,) or stage not in (DetectorStage, TriangulationStage):
+                known = {item.name for item in stage.PARAMETERS}
+                given = {"setup": str(folder), **{name: value for name, value in values.items() if name in known}}
+                made.append(stage(check_all(stage.PARAMETERS, given)))
+        runner = OfflineRunner(made, BAG_WIRE, keep)
         progress = Progress(bag.start_ns, bag.end_ns)
         runner.start(bag.start_ns)
         for raw in bag.messages(topics):
-            sink(raw.topic, raw.cdr, raw.log_time_ns)
             if raw.topic == setup.POINTS:
-                found.setdefault(raw.topic, []).append(raw.cdr)
+                keep(raw.topic, raw.cdr, raw.log_time_ns)
             runner.push(raw.topic, raw.cdr, raw.log_time_ns)
             progress.at(raw.log_time_ns)
         runner.finish(bag.end_ns)
         progress.end()
-    counters = Counter(runner.counters)
-    for each in made:
-        counters.update(each.counters)
-    return Tracked(found, {name: count for name, count in sorted(counters.items()) if count})
+    return found
 
 
 def points_of(bag_path: Path, folder: Path, diameter: float) -> list[Points]:
     """The points in a recording, frame by frame; ``diameter`` of the balls in metres, or 0."""
-    tracked = track(bag_path, folder, (DetectorStage, TriangulationStage), {"diameter": diameter})
-    return [SpacePoints().decode(cdr, BAG_WIRE) for cdr in tracked.messages.get(setup.POINTS, ())]
+    messages = track(bag_path, folder, (DetectorStage, TriangulationStage), {"diameter": diameter})
+    return [SpacePoints().decode(cdr, BAG_WIRE) for cdr in messages.get(setup.POINTS, ())]
 
 
 def poses_of(bag_path: Path, folder: Path, diameter: float) -> list[list[TargetPose]]:
     """The poses of the targets in a recording, frame by frame; ``diameter`` of the balls in metres, or 0."""
     stages = (DetectorStage, TriangulationStage, TrackerStage)
-    tracked = track(bag_path, folder, stages, {"deadline": 1.0, "diameter": diameter})
+    messages = track(bag_path, folder, stages, {"deadline": 1.0, "diameter": diameter})
     frames: dict[int, list[TargetPose]] = {}
     for target in load_targets(setup.file_of(folder, setup.TARGETS, "target")):
-        for cdr in tracked.messages.get(setup.pose_topic(target.name), ()):
+        for cdr in messages.get(setup.pose_topic(target.name), ()):
             pose = PoseOfTarget(target.name).decode(cdr, BAG_WIRE)
             frames.setdefault(pose.stamp_ns, []).append(pose)
     return [frames[stamp_ns] for stamp_ns in sorted(frames)]
@@ -300,35 +282,20 @@ def fit(args: argparse.Namespace) -> int:
 def angles(args: argparse.Namespace) -> int:
     """``markers angles``."""
     check_new_bag(args.output, overwrite=args.overwrite)
-    stages = (DetectorStage, TriangulationStage, TrackerStage, AnglesOfTargetsStage)
     with RigReader(args.bag) as bag:
-        needed = _after(sources_of(bag, args.setup), stages)
-    outputs = [
-        port for stage in needed for port in stage(check_all(stage.PARAMETERS, {"setup": str(args.setup)})).outputs
-    ]
-    # raises before anything is written
-    types = {port.topic: port.codec.type_name for port in outputs}
-    with BagWriter(args.output, overwrite=args.overwrite, flush_interval_s=float("inf")) as writer:
-        with RigReader(args.bag) as bag:
-            for topic in (*sources_of(bag, args.setup), *(t for t in bag.topics if t.startswith("/ground_truth/"))):
-                writer.add_topic(topic, bag.topics[topic].type_name, bag.topics[topic].offered)
-            for raw in bag.messages([topic for topic in bag.topics if topic.startswith("/ground_truth/")]):
-                writer.write(raw.topic, raw.cdr, raw.log_time_ns)
-        known: set[str] = set()
-
-        def write(topic: str, cdr: bytes, at_ns: int) -> None:
-            if topic not in known and topic in types:
-                writer.add_topic(topic, types[topic])
-            known.add(topic)
-            writer.write(topic, cdr, at_ns)
-
-        tracked = track(args.bag, args.setup, stages, {"diameter": args.diameter, "deadline": 1.0}, write)
-    count = len(tracked.messages.get(graph.joint_states_topic(setup.BODY), ()))
-    if not count:
-        raise MarkerCommandError(f"{args.bag}: no angles ({_listed(tracked.counters)})")
-    report = {"output": str(args.output), "frames": count, "counters": dict(tracked.counters)}
-    lines = [f"{count} frames of joint angles", f"on the way: {_listed(tracked.counters)}", f"written to {args.output}"]
-    return _say(args, report, lines)
+        sources_of(bag, args.setup)  # raises with a hint
+    settings = ReplaySettings(
+        (graph.NO_SENSORS,),
+        more={"marker_setup": str(args.setup)},
+        parameters={"marker_triangulation": {"diameter": args.diameter}},
+    )
+    found = replay(args.bag, args.output, settings, overwrite=args.overwrite)
+    counters = {name.partition(" ")[2]: count for name, count in found.counters.items()}  # without the nodes' names
+    listed = ", ".join(f"{name}: {count}" for name, count in sorted(counters.items()))
+    report = {"output": str(args.output), "frames": found.frames, "counters": counters}
+    return _say(
+        args, report, [f"{found.frames} frames of joint angles", f"on the way: {listed}", f"written to {args.output}"]
+    )
 
 
 def check(args: argparse.Namespace) -> int:
@@ -355,15 +322,6 @@ def check(args: argparse.Namespace) -> int:
             f"joints: none, the targets have poses but no angles; body_tracking markers fit makes {setup.CHAIN}"
         )
     return _say(args, report, lines)
-
-
-def _after(topics: Sequence[str], stages: Sequence[type[Stage]]) -> list[type[Stage]]:
-    """The stages that a recording with these sources needs: points need no cameras."""
-    return [stage for stage in stages if topics != (setup.POINTS,) or stage not in (DetectorStage, TriangulationStage)]
-
-
-def _listed(counters: Mapping[str, int]) -> str:
-    return ", ".join(f"{name}: {count}" for name, count in counters.items()) or "nothing at all"
 
 
 def _say(args: argparse.Namespace, report: Mapping[str, Any], lines: Iterable[str]) -> int:
