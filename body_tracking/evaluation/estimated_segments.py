@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from body_tracking.core.body_model import SEGMENTS
-from body_tracking.core.estimate import ModelEstimate
-from body_tracking.core.joint_angles import JointAngles
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, IntArray
 from body_tracking.evaluation.hand_eye import Track
 from body_tracking.evaluation.reading import (
     AngleSeries,
     EvaluationError,
     bodies,
+    model_angles,
     read_angles,
     read_joint_states,
     read_skeletons,
+    true_model_angles,
 )
-from body_tracking.kinematics.conventions import CONVENTIONS, Chain, angles_of, convention
+from body_tracking.kinematics.conventions import CONVENTIONS, Chain, convention
 from body_tracking.kinematics.euler import EulerAngles, EulerSequences
 from body_tracking.kinematics.tracking import SkeletonFit
 from body_tracking.kinematics.upper_body import UpperBody
@@ -117,19 +117,12 @@ def read_segments(path: Path, topic: str | None = None, body: str | None = None)
     if angles is None or name is None:
         if computed is None:
             raise EvaluationError(f"{path}: holds {graph.MODEL_STATE}, but no joint angles; make them with replay")
-        series: list[JointAngles] = []
-        for estimate in computed:
-            series.append(angles_of(estimate, model, "model", series[-1] if series else None))
         if angles is not None:
             warnings.append(
                 f"{path}: its joint angles are of no convention of the body model; those compared here are of the "
                 f"convention model, from {topic}"
             )
-        names = convention("model", model).names
-        position, stddev = (
-            np.stack([getattr(each, part) for each in series]) for part in ("position", "position_stddev")
-        )
-        angles, name = AngleSeries(stamps, names, position, stddev), "model"
+        angles, name = model_angles(computed, model, "model"), "model"
     return EstimatedSegments(path, topic, stamps, rotations, angles, name, tuple(warnings))
 
 
@@ -148,16 +141,12 @@ def read_true_segments(path: Path) -> EstimatedSegments | None:
         warnings = bag.warnings
     if state is None or state.names != model.coordinate_names:
         return None
-    q, lengths = model.integrate(model.neutral(), state.position), model.default_lengths()
-    exact, still = np.zeros((2 * model.nv, 2 * model.nv)), np.zeros(model.nv)
-    series: list[JointAngles] = []
-    for stamp_ns, each in zip(state.stamps_ns.tolist(), q, strict=True):
-        estimate = ModelEstimate(stamp_ns, "world", 0, each, still, exact, lengths, np.zeros_like(lengths))
-        series.append(angles_of(estimate, model, "model", series[-1] if series else None))
-    position = np.stack([each.position for each in series])
-    angles = AngleSeries(state.stamps_ns, series[0].names, position, np.zeros_like(position))
-    rotations = model.forward(q, lengths).rotations
-    return EstimatedSegments(path, graph.TRUE_MODEL_STATE, state.stamps_ns, rotations, angles, "model", tuple(warnings))
+    angles = true_model_angles(state, model, "model")
+    rotations = model.forward(model.integrate(model.neutral(), state.position), model.default_lengths()).rotations
+    return EstimatedSegments(
+        *(path, graph.TRUE_MODEL_STATE, state.stamps_ns, rotations),
+        *(replace(angles, stddev=np.zeros_like(angles.stddev)), "model", tuple(warnings)),
+    )
 
 
 def _convention_of(names: tuple[str, ...], model: UpperBody) -> str | None:

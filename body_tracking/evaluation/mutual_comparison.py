@@ -19,7 +19,7 @@ from body_tracking.evaluation.estimated_segments import EstimatedSegments
 from body_tracking.evaluation.hand_eye import MAX_GAP
 from body_tracking.evaluation.metrics import wrapped
 from body_tracking.evaluation.reading import AngleSeries, EvaluationError
-from body_tracking.evaluation.reference_error import Differences, Judged, judge
+from body_tracking.evaluation.reference_error import Differences, Judged, judge, notes_of
 from body_tracking.evaluation.start_clock import STAMPS_AS_THEY_ARE, start_clock
 from body_tracking.kinematics.labels import UNKNOWN
 
@@ -110,7 +110,7 @@ def compare_estimates(estimate: EstimatedSegments, reference: EstimatedSegments)
         tuple(each for each in judged if each is not None),
         float(np.sqrt((errors[known] ** 2).mean())),
         float(within[known].mean()),
-        (*estimate.warnings, *reference.warnings, *notes),
+        (*estimate.warnings, *reference.warnings, *notes, *notes_of(judged)),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
@@ -21,7 +21,6 @@ from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.base import MessageError, to_nanoseconds
 from body_tracking.messages.calibration import time_reference_to_clock, transform_to_pose
 from body_tracking.messages.cdr import decode_skeletons, stamp_of
-from body_tracking.messages.model import coordinates_to_configuration
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.pipeline import graph
 from body_tracking.recording.rig import RigReader
@@ -224,20 +223,32 @@ def true_angles(names: tuple[str, ...], own: AngleSeries | None, coordinates: An
         return own
     if coordinates is None or coordinates.names != model.coordinate_names:
         return own if own is None or own.names != ANGLE_NAMES else own.only(_IN_EVERY_CONVENTION)
+    found = true_model_angles(coordinates, model, of_names[names])
+    return replace(found, stddev=np.where(found.stddev > _AMPLIFIED * _EXACT, np.inf, found.stddev))
+
+
+def true_model_angles(coordinates: AngleSeries, model: UpperBody, name: str) -> AngleSeries:
+    """Angles in a convention from the true coordinates, as if these had errors of :data:`_EXACT`."""
     exact = _EXACT**2 * np.eye(2 * model.nv)
-    lengths = model.default_lengths()  # angles do not depend on them
-    rates = np.zeros(model.nv)
+    lengths, rates = model.default_lengths(), np.zeros(model.nv)  # angles do not depend on them
+    configurations = model.integrate(model.neutral(), coordinates.position)
+    states = (
+        ModelEstimate(stamp_ns, "", 0, q, rates, exact, lengths, np.zeros_like(lengths))
+        for stamp_ns, q in zip(coordinates.stamps_ns.tolist(), configurations, strict=True)
+    )
+    return model_angles(states, model, name)
+
+
+def model_angles(states: Iterable[ModelEstimate], model: UpperBody, name: str) -> AngleSeries:
+    """The angles of one or more consecutive states in a convention."""
     series: list[JointAngles] = []
-    for stamp_ns, tangent in zip(coordinates.stamps_ns, coordinates.position, strict=True):
-        q, _ = coordinates_to_configuration(tangent, rates, model)
-        estimate = ModelEstimate(int(stamp_ns), "", 0, q, rates, exact, lengths, np.zeros_like(lengths))
-        series.append(angles_of(estimate, model, of_names[names], series[-1] if series else None))
-    stddev = np.stack([each.position_stddev for each in series])
+    for state in states:
+        series.append(angles_of(state, model, name, series[-1] if series else None))
     return AngleSeries(
-        coordinates.stamps_ns,
-        names,
+        np.array([each.stamp_ns for each in series], dtype=np.int64),
+        series[0].names,
         np.stack([each.position for each in series]),
-        np.where(stddev > _AMPLIFIED * _EXACT, np.inf, stddev),
+        np.stack([each.position_stddev for each in series]),
     )
 
 

@@ -24,8 +24,8 @@ from body_tracking.evaluation.estimated_segments import EstimatedSegments, joint
 from body_tracking.evaluation.hand_eye import HandEye, HandEyeError, Mounting, fit_hand_eye
 from body_tracking.evaluation.marker_reference import MarkerReference
 from body_tracking.evaluation.metrics import angle_errors, wrapped
-from body_tracking.evaluation.reading import EvaluationError
-from body_tracking.evaluation.reference_error import Differences, Judged, judge
+from body_tracking.evaluation.reading import EvaluationError, nearest
+from body_tracking.evaluation.reference_error import Differences, Judged, judge, notes_of
 from body_tracking.evaluation.start_clock import STAMPS_AS_THEY_ARE, start_clock
 from body_tracking.kinematics.conventions import Chain
 from body_tracking.kinematics.upper_body import PARENTS, UpperBody
@@ -142,7 +142,7 @@ def evaluate_by_markers(
             "constant offsets of the estimate do not show: mountings are fitted to it and absorb them. They show with "
             "--mountings from another recording"
         )
-    notes += _notes(orientations + angles)
+    notes += notes_of(orientations + angles)
     return ReferenceEvaluation(
         estimate,
         reference,
@@ -157,16 +157,6 @@ def evaluate_by_markers(
         curves,
         (*estimate.warnings, *reference.warnings, *notes),
     )
-
-
-def _notes(judged: Sequence[Judged | None]) -> list[str]:
-    poor = [each.name for each in judged if each is not None and each.too_poor]
-    if not poor:
-        return []
-    return [
-        f"the reference is too poor for {', '.join(poor)}: its own deviation is not below half of the difference, so "
-        "that only an upper bound of the error is given"
-    ]
 
 
 # --- the clock
@@ -313,7 +303,7 @@ def _angles(
     """All angles that the mounted targets determine, and their curves."""
     series = estimate.angles
     chains = joint_chains(estimate.convention, frozenset(reference.segments.values()), UpperBody())
-    rows = [_rows(series.stamps_ns, each.stamps_ns) for each in compared]
+    rows = [nearest(series.stamps_ns, each.stamps_ns, 0) for each in compared]
     judged: list[Judged | None] = []
     names, found, true, stddev = [], [], [], []
     for chain in chains:
@@ -345,10 +335,3 @@ def _angles(
     shape = (len(times), len(names))
     a, b, c = (np.stack(each, axis=1) if each else np.empty(shape) for each in (found, true, stddev))
     return judged, AngleComparison(tuple(names), times, a, b, c, angle_errors(a, b, c))
-
-
-def _rows(stamps_ns: IntArray, wanted_ns: IntArray) -> IntArray:
-    """(n,) row of each wanted stamp; -1 if there is none."""
-    index = np.clip(np.searchsorted(stamps_ns, wanted_ns), 0, len(stamps_ns) - 1)
-    result: IntArray = np.where(stamps_ns[index] == wanted_ns, index, -1)
-    return result

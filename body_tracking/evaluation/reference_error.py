@@ -16,7 +16,7 @@ c c^T / 2 a one-draw estimate of the variance of each. Its excess over the state
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -145,6 +145,17 @@ def judge(name: str, parts: Sequence[Differences], *, mountings_known: bool) -> 
         _signed(change),
         _covered(parts),
     )
+
+
+def notes_of(judged: Iterable[Judged | None]) -> list[str]:
+    """A note on the quantities for which the reference is too poor; none if there are none."""
+    poor = ", ".join(each.name for each in judged if each is not None and each.too_poor)
+    if not poor:
+        return []
+    return [
+        f"the reference is too poor for {poor}: its own deviation is not below half of the difference, so that only an "
+        "upper bound of the error is given"
+    ]
 
 
 def _lasting(change: FloatArray, parts: Sequence[Differences], mountings: Sequence[FloatArray]) -> FloatArray:

@@ -97,7 +97,7 @@ def mutual_report_of(result: MutualComparison) -> Report:
         ("clock", f"the reference's minus the estimate's {clock}"),
         *_in_words("angles", result.angles),
         ("", f"RMS difference of all {np.degrees(result.measured):.1f} deg"),
-        *(("note", note) for note in (*result.notes, *_notes(result))),
+        *(("note", note) for note in result.notes),
     )
     content = {
         "estimate": str(estimate.source),
@@ -119,13 +119,6 @@ _MUTUAL = (
     "difference: RMS of estimate minus reference. reference: RMS deviation that the reference states of itself.\n"
     "error: the difference without that, in quadrature, and its 95 % interval; - where the reference is too poor."
 )
-
-
-def _notes(result: MutualComparison) -> tuple[str, ...]:
-    poor = [each.name for each in result.angles if each.too_poor]
-    if not poor:
-        return ()
-    return (f"the reference is too poor for {', '.join(poor)}: its own deviation is not below half of the difference",)
 
 
 def report_of(result: ReferenceEvaluation) -> Report:
