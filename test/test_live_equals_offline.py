@@ -174,10 +174,8 @@ def live_as_offline(
     a report is an error.
     """
     said: list[object] = []
+    saved: tuple[str | Path, ...] = () if calibration is None else ("--calibration", calibration)
     for rate in ("1", "0.5", "0.25"):
-        saved: tuple[str | Path, ...] = ()
-        if calibration is not None:
-            saved = "--calibration", shutil.copy(calibration, folder / "live.yaml")  # the graph writes into it
         live = recorded(folder, f"live_{rate}", "--bag", bag, "--rate", rate, *arguments, *saved)
         found = differences(live, folder / "offline", without)
         if not found:

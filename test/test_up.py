@@ -181,6 +181,26 @@ def test_every_node_may_be_killed_and_tracking_is_back_within_three_seconds(
     assert stamps[-1] - stamps[0] > 0.8 * (last_ns - first_ns)
 
 
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_bag_writes_a_calibration_only_where_there_was_none(
+    up: Callable[..., Up], tmp_path: Path, kept: bool
+) -> None:
+    """A bag of other people or another day would replace the calibration of a laboratory."""
+    file, bag = tmp_path / "lab.yaml", beginning(BAG, tmp_path / "excerpt", 5.0)
+    if kept:
+        assert cli.main(["calibrate", str(BAG), "-o", str(file)]) == 0
+    before = file.read_text() if kept else None
+    parameters = tmp_path / "parameters.yaml"
+    parameters.write_text(f"calibration: {{ros__parameters: {{calibration_file: {file}}}}}")
+    named = ("--params-file", parameters) if kept else ("--calibration", file)
+    graph_up = up("--bag", bag, *named, "--reliable")
+    assert graph_up.until(lambda: graph_up.process.poll() is not None, timeout=120.0), graph_up.text()
+    assert graph_up.process.returncode == 0, graph_up.text()
+    (log,) = tmp_path.glob("body_tracking_up_*/calibration.log")
+    assert (file.read_text() == before) is kept
+    assert (f"{file}: loaded, not to be written" in log.read_text()) is kept
+
+
 @pytest.mark.parametrize("how", some([signal.SIGKILL, signal.SIGTERM]))
 def test_no_process_remains_of_an_up_that_ends_while_its_nodes_start(
     up: Callable[..., Up], tmp_path: Path, how: signal.Signals

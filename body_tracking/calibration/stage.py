@@ -46,6 +46,7 @@ class CalibrationStage(Stage):
             "YAML file: loaded at the start if it exists, saved when the result changes; or empty",
             fixed="it is loaded at the start",
         ),
+        Parameter("save", True, "whether calibration_file is written; by up and launch not where a bag finds one"),
         WORLD_FRAME,
         *parameters_from(
             CalibrationParameters,
@@ -72,7 +73,8 @@ class CalibrationStage(Stage):
         if self._file is not None and self._file.exists():
             loaded = load(self._file)
             self.calibration.load(loaded)
-            self.events.append(f"{self._file}: loaded{lacking(loaded, sensors)}")
+            kept = "" if values["save"] else ", not to be written"
+            self.events.append(f"{self._file}: loaded{kept}{lacking(loaded, sensors)}")
         self._unsaved = self._saved = False
         self._subjects = {sensor: SubjectSelector() for sensor in sensors}
         self._odd: dict[str, tuple[int, float]] = {}
@@ -149,7 +151,7 @@ class CalibrationStage(Stage):
 
     def save(self) -> None:
         """Write the file, if anything changed."""
-        if self._file is not None and self._unsaved:
+        if self._file is not None and self._unsaved and self.values["save"]:
             # The published poses, not the estimates toward which they still slew: a restart must not jump.
             save(self.calibration.current_update().result, self._file)
             if not self._saved:  # not each time: it is every few seconds at first

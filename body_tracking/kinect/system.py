@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
+from pathlib import Path
 
 from body_tracking.core.message_types import MARKERS, POINT_CLOUD, TIME_REFERENCE, TRANSFORM
 from body_tracking.core.parameters import Value
@@ -37,9 +38,10 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
         return
     several = sensors_and_transport(options)
     yield NodeSpec("fusion", "fusion", parameters={**several, **asked(options, subject="subject", people="people")})
-    yield NodeSpec(
-        "calibration", "calibration", parameters={**several, **asked(options, calibration_file="calibration")}
-    )
+    file = asked(options, calibration_file="calibration")
+    if options["bag"] and file and Path(str(options["calibration"])).expanduser().exists():
+        file["save"] = False  # the people and clocks of a bag may not be those of the file
+    yield NodeSpec("calibration", "calibration", parameters={**several, **file})
     if options["bag"] or options["external"]:
         return
     adapted = _adapted(options)
@@ -150,9 +152,11 @@ SYSTEM = System(
         Option(
             "calibration",
             "",
-            "YAML file of the calibration: loaded if it exists, saved when the result changes",
+            "YAML file of the calibration: loaded if it exists, saved when the result changes; a bag changes no "
+            "existing file",
             "FILE",
             path=True,
+            parameter=("calibration", "calibration_file"),
             offline=True,
         ),
         Option("reliable", False, "transport skeletons reliably: nothing is lost, but delays may grow"),
