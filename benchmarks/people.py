@@ -144,7 +144,7 @@ def real(file: Path, folder: Path) -> dict[str, Any]:
     """Part 2."""
     bag = folder / "two_people"
     import_files([file], bag)
-    result, _ = calibrate(bag, CalibrationParameters())
+    result, *_ = calibrate(bag, CalibrationParameters())
     people = People(tuple(result.poses), EVERYBODY)
     for pose in result.poses.values():
         people.set_pose(pose)

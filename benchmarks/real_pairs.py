@@ -196,7 +196,7 @@ def measure(file: Path, folder: Path, parameters: EkfParameters | None = None) -
     report = replay(bag, out, ReplaySettings(()))
     figures: dict[str, Any] = {"recording": file.name.split(".")[0], "layout": layout}
     for method in ("robust", "thesis"):
-        result, _ = calibrate(bag, CalibrationParameters(method=method))
+        result, *_ = calibrate(bag, CalibrationParameters(method=method))
         figures[f"{method}_yaw_deg"] = float(np.degrees(relative_yaw(result, "kinect2")))
         figures[f"{method}_mm"] = 1e3 * disagreement(bag, result)
         if method == "robust":

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from body_tracking.calibration.advice import APART, ROUGH, WAITING
 from body_tracking.calibration.clock import LIKE, RECEIPT_PRIOR, correlate_clocks, joint_speeds
 from body_tracking.calibration.clock_correlation import DRIFT_PRIOR, FINE_RANGE, ClockFit
 from body_tracking.calibration.coverage import Coverage
@@ -95,6 +96,12 @@ ESTIMATE_PERIOD = 1.0
 
 SLEW_ROTATION, SLEW_TRANSLATION = 0.05, 0.05
 """Fastest turn of a published pose toward a better one, rad/s, and fastest move at the person's place, m/s."""
+
+MAX_TRANSLATION_STDDEV = 0.05
+"""Metres, at the person's place: greatest standard deviation of a good calibration."""
+
+MAX_RESIDUAL = 0.15
+"""Metres: greatest median residual of a good calibration; nine real pairs of Kinects have 0.03 to 0.11."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -760,15 +767,18 @@ class OnlineCalibration:
     def status(self) -> tuple[int, str, dict[str, object]]:
         """Diagnostic level (0 OK, 1 warning), one line, and values per sensor."""
         values: dict[str, object] = {"reference": self.reference, "method": self.parameters.method}
-        waiting, uncertain = [], []
+        waiting, uncertain, apart = [], [], []
         for name, other in self._sensors.items():
             if other.rotation is None:
                 waiting.append(name)
                 continue
             quality, clock = other.quality, other.clock
             at_ns = clock.anchor_ns if self._now is None else self._now
-            if not quality.rotation_stddev < self.parameters.max_rotation_stddev:
+            places = quality.translation_stddev < MAX_TRANSLATION_STDDEV
+            if not (places and quality.rotation_stddev < self.parameters.max_rotation_stddev):
                 uncertain.append(name)
+            if quality.residual > MAX_RESIDUAL:
+                apart.append(name)
             values |= {
                 f"{name} residual_mm": round(1e3 * quality.residual, 1),
                 f"{name} rotation_stddev_deg": round(float(np.degrees(quality.rotation_stddev)), 2),
@@ -782,9 +792,12 @@ class OnlineCalibration:
                 f"{name} late_frames": other.track.late,
             }
         if waiting:
-            return 1, f"waiting for a still pose seen by {self.reference} and {', '.join(waiting)}", values
+            return 1, f"{WAITING} seen by {self.reference} and {', '.join(waiting)}", values
+        if apart:
+            most = f"median residual above {1e3 * MAX_RESIDUAL:.0f} mm"
+            return 1, f"{self.reference} and {', '.join(apart)} {APART} ({most})", values
         if uncertain:
-            return 1, f"{', '.join(uncertain)}: roughly calibrated, walk about to refine", values
+            return 1, f"{', '.join(uncertain)}: {ROUGH}", values
         if self._now is None and not self._sensors:
             return 1, f"no skeleton of {self.reference} yet", values
         return 0, "calibrated", values

@@ -73,8 +73,8 @@ class CalibrationStage(Stage):
         if self._file is not None and self._file.exists():
             loaded = load(self._file)
             self.calibration.load(loaded)
-            kept = "" if values["save"] else ", not to be written"
-            self.events.append(f"{self._file}: loaded{kept}{lacking(loaded, sensors)}")
+            note = "" if values["save"] else ", not to be written"
+            self.events.append(f"{self._file}: loaded{note}{lacking(loaded, sensors)}")
         self._unsaved = self._saved = False
         self._subjects = {sensor: SubjectSelector() for sensor in sensors}
         self._odd: dict[str, tuple[int, float]] = {}

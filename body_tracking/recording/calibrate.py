@@ -11,20 +11,20 @@ from typing import Any
 
 import numpy as np
 
-from body_tracking.calibration.online import CalibrationParameters, OnlineCalibration
+from body_tracking.calibration.advice import next_step, quality
+from body_tracking.calibration.online import MAX_TRANSLATION_STDDEV, CalibrationParameters, OnlineCalibration
 from body_tracking.calibration.rigid import CalibrationError
 from body_tracking.calibration.storage import save, to_dict
 from body_tracking.core.files import check_new
 from body_tracking.core.parameters import fields_of
 from body_tracking.core.sensor_poses import CalibrationResult
+from body_tracking.messages.node_status import NodeStatus
 from body_tracking.node_parameters import parameters_for
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.replay import sensor_topics, skeletons_of
 from body_tracking.recording.rig import RigReader
 from body_tracking.systems import all_nodes_for, nodes_for, options_of
 
-_LARGE_RESIDUAL = 0.15
-"""Metres: median residual that is warned of; nine real pairs of Kinects have 0.03 to 0.11."""
 HISTORY_S = 600.0
 """Seconds of raw frames kept: a recording up to this length is interpolated again with the final clock."""
 
@@ -46,7 +46,7 @@ def relative_yaw(result: CalibrationResult, sensor: str) -> float:
 
 def calibrate(
     bag_path: Path, parameters: CalibrationParameters, sensors: tuple[str, ...] = (), reference: str = ""
-) -> tuple[CalibrationResult, list[str]]:
+) -> tuple[CalibrationResult, list[str], NodeStatus]:
     """Calibrate from a whole bag.
 
     Args:
@@ -56,7 +56,7 @@ def calibrate(
         reference: the sensor that defines ``world``; the first when empty.
 
     Returns:
-        The result, and events, a line each.
+        The result, events, a line each, and the status, as the node ``calibration`` reports it.
 
     Raises:
         ReplayError: no skeletons in the bag.
@@ -81,13 +81,15 @@ def calibrate(
     if not frames:
         raise CalibrationError(f"{bag_path}: no frame can be used ({'; '.join(events) or 'there is none'})")
     result = calibration.finish()
+    level, text, values = calibration.status()
+    status = NodeStatus("calibration", level, text, {key: str(value) for key, value in values.items()})
     missing = [name for name in names if name not in result.poses]
     if missing:
         raise CalibrationError(
-            f"{bag_path}: {', '.join(missing)} could not be calibrated against {calibration.reference}: "
-            f"{calibration.status()[1]}"
+            f"{bag_path}: {', '.join(missing)} could not be calibrated against {calibration.reference}: {text}; "
+            f"record again, and {next_step(status)}"
         )
-    return result, [*calibration.events, *events]
+    return result, [*calibration.events, *events], status
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -125,11 +127,12 @@ def run(args: argparse.Namespace) -> int:
     if args.method:
         parameters = replace(parameters, method=args.method)
     sensors = tuple(args.sensors.split(",")) if args.sensors else ()
-    result, events = calibrate(args.bag, parameters, sensors, args.reference or "")
+    result, events, status = calibrate(args.bag, parameters, sensors, args.reference or "")
     if args.output is not None:
         save(result, args.output)
     if args.json:
-        data: dict[str, Any] = {"method": parameters.method, **to_dict(result), "events": events}
+        data: dict[str, Any] = {"method": parameters.method, "good": not status.level, **to_dict(result)}
+        data |= {"events": events}
         for name, entry in data["sensors"].items():
             entry["relative_yaw_deg"] = float(np.degrees(relative_yaw(result, name)))
         print(json.dumps(data, indent=2))
@@ -137,30 +140,24 @@ def run(args: argparse.Namespace) -> int:
     for event in events:
         print(event)
     for name, pose in result.poses.items():
-        clock, quality = result.clocks[name], result.quality[name]
+        clock, stated = result.clocks[name], result.quality[name]
         x, y, z = pose.translation
         # without an estimate from movement, which has a deviation, it is that of the still pose
-        of_what = "median" if np.isfinite(quality.rotation_stddev) else "mean"
+        of_what = "median" if np.isfinite(stated.rotation_stddev) else "mean"
         if name == result.reference:
             print(f"{name}: reference, at ({x:.3f}, {y:.3f}, {z:.3f}) m in world")
             continue
         print(
             f"{name}: at ({x:.3f}, {y:.3f}, {z:.3f}) m in world, yaw {np.degrees(relative_yaw(result, name)):.2f} deg "
-            f"(+-{np.degrees(quality.rotation_stddev):.2f}), "
-            f"clock {clock.offset:+.4f} s (+-{quality.clock_stddev:.4f}), "
-            f"drift {clock.drift_ppm:+.0f} ppm, {of_what} residual {1e3 * quality.residual:.0f} mm"
+            f"(+-{np.degrees(stated.rotation_stddev):.2f}), "
+            f"clock {clock.offset:+.4f} s (+-{stated.clock_stddev:.4f}), "
+            f"drift {clock.drift_ppm:+.0f} ppm, {of_what} residual {1e3 * stated.residual:.0f} mm"
         )
-        if not quality.rotation_stddev < parameters.max_rotation_stddev:
-            limit = np.degrees(parameters.max_rotation_stddev)
-            print(
-                f"warning: {name}: the yaw is uncertain (good is below {limit:.1f} deg); record more motion, or other "
-                "poses, with all of the person in view of both sensors"
-            )
-        if quality.residual > _LARGE_RESIDUAL:
-            print(
-                f"warning: {name}: a residual of {1e3 * quality.residual:.0f} mm is large (real pairs have 30 to 110); "
-                "the sensors may see different people, or one takes the back for the front"
-            )
+    limits = f"{np.degrees(parameters.max_rotation_stddev):.1f} degrees and {1e3 * MAX_TRANSLATION_STDDEV:.0f} mm"
+    verdict = f"not good enough: {status.text}; " if status.level else "good: "
+    print(f"{verdict}{quality(status)} (good is below {limits})")
+    if status.level:
+        print(f"next: record again, and {next_step(status)}")
     if args.output is not None:
         print(f"saved to {args.output}")
     return 0

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
+from body_tracking.calibration.advice import next_step, quality
 from body_tracking.messages.node_status import NodeStatus
 from body_tracking.viewing.status import FRESH
 
@@ -101,23 +102,11 @@ def _calibration(there: Mapping[str, NodeStatus]) -> str:
     status = there.get(CALIBRATION)
     if status is None:
         return ""
-    known = []
-    for key in status.values:
-        if key.endswith(" rotation_stddev_deg"):
-            sensor = key.removesuffix(" rotation_stddev_deg")
-            degrees, millimetres = status.number(key), status.number(f"{sensor} translation_stddev_mm")
-            if degrees is not None and millimetres is not None:
-                known.append(f"{html.escape(sensor)} to {degrees:.1f}° and {millimetres:.0f} mm")
-    if status.text.startswith("waiting for a still pose"):
-        todo = "hold a T-pose (arms straight, level and sideways) for four seconds where all sensors see you"
-    elif status.level:
-        todo = "walk about and turn where all sensors see you, until this is green"
-    elif known:
+    known, todo = quality(status), next_step(status)
+    if known and not status.level:
         todo = "done; start again after a sensor has moved"
-    else:
-        return line(GREEN, "calibration", html.escape(status.text))
-    text = f"{html.escape(status.text)}{': ' if known else ''}{', '.join(known)} ({todo})"
-    return line(ORANGE if status.level else GREEN, "calibration", text)
+    text = f"{status.text}{': ' if known else ''}{known}{f' ({todo})' if todo else ''}"
+    return line(ORANGE if status.level else GREEN, "calibration", html.escape(text))
 
 
 def _recording(there: Mapping[str, NodeStatus]) -> str:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from body_tracking import cli
+from body_tracking.calibration import online
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.message_types import DIAGNOSTICS, JOINT_STATE, POINT_CLOUD, TIME_REFERENCE, TRANSFORM
 from body_tracking.core.parameters import ParameterError
@@ -30,7 +31,6 @@ from body_tracking.messages.diagnostics import diagnostics
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.offline import OfflineRunner
-from body_tracking.recording import calibrate
 from body_tracking.recording.importer import import_files
 from body_tracking.recording.replay import ReplayError, ReplaySettings, replay
 from body_tracking.recording.rig import RigReader
@@ -377,10 +377,13 @@ def test_calibrate_prints_poses_and_clocks(
         assert re.search(rf"^kinect2: at \(.*, {kind} residual \d+ mm$", said, re.MULTILINE)
     strict = tmp_path / "strict.yaml"
     strict.write_text("calibration:\n  ros__parameters:\n    max_rotation_stddev: 0.001\n")
-    monkeypatch.setattr(calibrate, "_LARGE_RESIDUAL", 0.01)
-    warned = command("calibrate", wave, "--params-file", strict)[1]
-    assert "warning: kinect2: the yaw is uncertain" in warned
-    assert re.search(r"^warning: kinect2: a residual of \d+ mm is large", warned, re.MULTILINE)
+    assert "\ngood: kinect2 to 1." in out and " mm (good is below 2.9 degrees and 50 mm)" in out
+    said = command("calibrate", wave, "--params-file", strict)[1]
+    assert "\nnot good enough: kinect2: roughly calibrated" in said and "(good is below 0.1 degrees and 50 mm)" in said
+    assert "\nnext: record again, and walk about and turn where all sensors see you\n" in said
+    monkeypatch.setattr(online, "MAX_RESIDUAL", 0.01)
+    said = command("calibrate", wave)[1]
+    assert "\nnot good enough: kinect1 and kinect2 do not see the same pose (median residual above 10 mm); " in said
     # A saved calibration can be used from the first frame on.
     brief = beginning(BAG, tmp_path / "brief", 2.0)
     code, out, error = command(

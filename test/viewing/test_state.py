@@ -30,7 +30,7 @@ def test_the_calibration_says_how_well_and_what_to_do_next() -> None:
     waiting = said("calibration", "waiting for a still pose seen by a and b", {}, level=1)
     assert "T-pose" in waiting
     rough = said("calibration", "kinect2: roughly calibrated, walk about to refine", KNOWN, level=1)
-    assert "kinect2 to 1.2\u00b0 and 8 mm" in rough and "walk about and turn" in rough
+    assert "kinect2 to 1.2 degrees and 8 mm" in rough and "walk about and turn" in rough
     assert "done" in said("calibration", "calibrated", KNOWN)
 
 
