@@ -38,8 +38,8 @@ _LOSSES = ("dropped ", "lost ", "left out after a standstill ")
 """Beginnings of the keys, before the topic, by which a node counts messages that it did not process."""
 _SHOWING = ("viewer", "body_markers")
 """Nodes that show the latest messages, and leave out others on purpose."""
-_NOTABLE_LOSS = 0.01
-"""Share of a node's received messages."""
+_NOTABLE_LOSS, _FEW = 0.01, 10
+"""Share of a node's received messages, and a number that is lost where a node has just started."""
 _REPORTED_S = 1.5
 """Seconds of a bag after which each node has reported what it gets of it."""
 _FRESH = 3.0
@@ -71,7 +71,7 @@ def problem_parts(statuses: Mapping[str, NodeStatus], *, bag_starts: bool = Fals
 
 
 def losses_part(statuses: Mapping[str, NodeStatus], before: Mapping[str, NodeStatus] | None = None) -> list[str]:
-    """The messages that nodes did not process, where they are more than one in a hundred received ones.
+    """The messages that nodes did not process, where they are more than ten, and than one in a hundred received ones.
 
     Args:
         statuses: by node.
@@ -86,7 +86,7 @@ def losses_part(statuses: Mapping[str, NodeStatus], before: Mapping[str, NodeSta
             earlier = _losses(before[name])
             if earlier[0] <= lost and earlier[1] <= received:  # the node was not started anew
                 lost, received = lost - earlier[0], received - earlier[1]
-        if lost > _NOTABLE_LOSS * received:
+        if lost > max(_FEW, _NOTABLE_LOSS * received):
             found.append(f"{name} {lost:.0f}")
     return [f"messages not processed (machine or network too slow): {', '.join(found)}"] if found else []
 
