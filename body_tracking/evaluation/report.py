@@ -68,18 +68,24 @@ class Table:
         """The numbers of a row by column key."""
         return {column.key: float(column.values[self.names.index(name)]) for column in self.columns}
 
-    def text(self) -> str:
-        """Titles, units, a line and the rows."""
-        titles = [self.title, *(column.title for column in self.columns)]
-        rows = [titles, ["", *(column.unit for column in self.columns)]]
-        rows += [[name, *(column.text(row) for column in self.columns)] for row, name in enumerate(self.names)]
-        first, *widths = (max(map(len, cells)) for cells in zip(*rows, strict=True))
-        widths = [max(each, 6) for each in widths]
-        header, units, *others = (
-            " ".join([f"{name:<{first}}", *(f"{cell:>{width}}" for cell, width in zip(cells, widths, strict=True))])
-            for name, *cells in rows
-        )
-        return "\n".join([header, units, "-" * len(header), *others])
+    def text(self, width: int = 120) -> str:
+        """Titles, units, a line and the rows; columns beyond the width follow below."""
+        first = max(map(len, (self.title, *self.names)))
+        names = [f"{name:<{first}}" for name in (self.title, "", *self.names)]
+        blocks, used = [[names]], first
+        for column in self.columns:
+            cells = [column.title, column.unit, *map(column.text, range(len(self.names)))]
+            own = max(6, *map(len, cells))
+            used += 2 + own
+            if used > width:
+                blocks.append([names])
+                used = first + 2 + own
+            blocks[-1].append([f"{cell:>{own}}" for cell in cells])
+        lines = []
+        for block in blocks:
+            header, units, *rows = map("  ".join, zip(*block, strict=True))
+            lines += ["", header, units, "-" * len(header), *rows]
+        return "\n".join(lines[1:])
 
     def pooled(self, groups: dict[str, IntArray], rows: IntArray) -> Table:
         """A table of the given rows, plus a pooled row per group."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import csv
 import io
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -47,11 +48,13 @@ def summary(angles: AngleSeries, truth: AngleSeries | None = None) -> Table:
         ]
     if are_fine(angles):
         columns = [each._replace(digits=3) if each.unit == "deg" else each for each in columns]
-    note = "stddev: median" + (", inf if unknown in most frames" if np.isinf(columns[3].values).any() else "")
-    note += ". final: the last one that is known. finite: share of the frames with an angle, however large its stddev."
-    note += "\n-: known in less than 2 % of the frames."
+    columns = [each._replace(digits=0) if each.unit == "%" else each for each in columns]
+    note = "final: the last known angle\nstddev: median" + (
+        "; inf if unknown in most frames" if np.isinf(columns[3].values).any() else ""
+    )
+    note += "\nfinite: frames with an angle, however large its stddev\n-: known in less than 2 % of the frames"
     if np.isfinite(error).any():
-        note += " From true min on: of frames with a truth. in 2 sd: errors within two stddev; 95 % is ideal."
+        note += "\nfrom true min on: over the frames with a truth\nin 2 sd: errors within two stddev; 95 % is ideal"
     return Table("angles", "angle", angles.names, tuple(columns), note)
 
 
@@ -119,7 +122,8 @@ def run(args: argparse.Namespace) -> int:
         raise EvaluationError(f"{args.output}: expected a name that ends in .png")
     tracked = read(args.bag, args.body, args.truth)
     table = summary(tracked.angles, tracked.true_angles)
-    print(f"{table.text()}\n{table.note}", flush=True)  # drawing takes seconds
+    width = shutil.get_terminal_size((120, 24)).columns
+    print(f"{table.text(width)}\n\n{table.note}", flush=True)  # drawing takes seconds
     if args.csv is not None:
         write_csv(tracked.angles, args.csv)
         print(f"\nangles: {args.csv}")

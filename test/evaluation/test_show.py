@@ -129,6 +129,17 @@ def test_titles_stand_above_their_columns() -> None:
     assert all(titles[:end].endswith(column.title) for column, end in zip(fine.columns, ends, strict=True))
 
 
+@pytest.mark.parametrize("width", [80, 120])
+def test_columns_are_apart_and_those_beyond_the_width_follow_below(width: int) -> None:
+    angles, truth = (series([10.0, -123.4], [s, s], "shoulder_plane_of_elevation_right") for s in (1.0, 0.0))
+    table = summary(angles, truth)
+    text = table.text(width)
+    assert max(map(len, text.splitlines())) <= width
+    assert text.count(angles.names[0]) == (2 if width == 80 else 1)
+    titles = [match for line in text.splitlines() for match in re.split(" {2,}", line)]
+    assert all(column.title in titles for column in table.columns)
+
+
 def test_a_picture_says_its_unit_and_names_sides_only_where_there_are_some(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -186,7 +197,7 @@ def test_a_truth_in_another_world_is_drawn_onto_the_estimate(monkeypatch: pytest
 
 def test_an_angle_never_known_is_dashes_and_infinity() -> None:
     line = summary(series([np.nan, 5.0], [np.inf, np.inf])).text().splitlines()[-1].split()
-    assert line == ["knee", "-", "-", "-", "inf", "0.0"]
+    assert line == ["knee", "-", "-", "-", "inf", "0"]
 
 
 def test_the_nearest_stamp_is_the_nearest_or_none() -> None:
