@@ -7,28 +7,14 @@ import importlib
 import os
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING
 
 from body_tracking import __version__
+from body_tracking.core.arguments import Parser
 from body_tracking.core.errors import BodyTrackingError
 
 if TYPE_CHECKING:
     from body_tracking.pipeline.system import Command
-
-
-class Parser(argparse.ArgumentParser):
-    """A parser whose errors are one line that names the command's help, instead of its whole usage."""
-
-    def error(self, message: str) -> NoReturn:
-        """Exit with code 2."""
-        self.exit(2, f"body_tracking: {message}; see {self.prog} --help\n")
-
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """As the base class; exits for an unknown argument, which argparse would leave to the outermost parser."""
-        found, unknown = super().parse_known_args(args, namespace)
-        if unknown:
-            self.error(f"unrecognized arguments: {' '.join(unknown)}")
-        return found, unknown
 
 
 def subcommands() -> dict[str, Command]:

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from body_tracking.core.errors import did_you_mean
 from body_tracking.core.parameters import (
     Parameter,
     ParameterError,
@@ -47,8 +48,9 @@ def parameters_for(
     for pattern, values in sections.items():
         about = [spec for spec in possible.values() if spec.in_section(pattern)]
         if not about:
-            there = ", ".join(spec.full_name for spec in possible.values())
-            raise ParameterError(f"{file}: {pattern}: no such node; there are {there}")
+            there = [spec.full_name for spec in possible.values()]
+            hint = did_you_mean(pattern, there) or f"; there are {', '.join(there)}"
+            raise ParameterError(f"{file}: {pattern}: no such node{hint}")
         given_here = {name: value for name, value in values.items() if not is_ros_own(name)}
         known = _table(spec for spec in about if spec.name in tables)
         if not given_here.keys() <= known.keys():  # of absent nodes, whose modules take a second to import

@@ -95,11 +95,17 @@ def test_missing_files_are_reported_in_one_line(
 @pytest.mark.parametrize(
     ("words", "said", "command"),
     [
-        ("replay bag -o out --filtre ekf", "unrecognized arguments: --filtre ekf", "body_tracking replay"),
+        (
+            "replay bag -o out --filtre ekf",
+            "unrecognized arguments: --filtre ekf; did you mean '--filter'?",
+            "body_tracking replay",
+        ),
         ("up --rate fast", "argument --rate: invalid float value: 'fast'", "body_tracking up"),
         ("replay bag", "the following arguments are required: -o/--output", "body_tracking replay"),
         ("camera show image.png -o out.png --large", "unrecognized arguments: --large", "body_tracking camera show"),
-        ("replya bag", "argument COMMAND: invalid choice: 'replya'", "body_tracking"),
+        ("replya bag", "argument COMMAND: invalid choice: 'replya'; did you mean 'replay'?", "body_tracking"),
+        ("up --filter efk", "argument --filter: invalid choice: 'efk'; did you mean 'ekf'?", "body_tracking up"),
+        ("up --filter xyz", "argument --filter: invalid choice: 'xyz' (choose from ", "body_tracking up"),
     ],
 )
 def test_a_wrong_argument_is_one_line_that_names_the_help_of_its_command(
@@ -109,7 +115,7 @@ def test_a_wrong_argument_is_one_line_that_names_the_help_of_its_command(
         cli.main(words.split())
     assert ended.value.code == 2
     captured = capsys.readouterr()
-    assert captured.err.startswith(f"body_tracking: {said}") and captured.err.endswith(f"; see {command} --help\n")
+    assert captured.err.startswith(f"body_tracking: {said}") and captured.err.endswith(f" (see {command} --help)\n")
     assert captured.err.count("\n") == 1 and not captured.out
 
 

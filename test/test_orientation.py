@@ -29,6 +29,7 @@ def test_valid_orientations_are_accepted() -> None:
     ("field", "value", "text"),
     [
         ("segment", "forearm", "segment 'forearm', expected one of pelvis, "),
+        ("segment", "forearm_letf", "; did you mean 'forearm_left'?"),
         ("rotation", np.zeros((3, 3)), "rotation is no rotation matrix"),
         ("rotation", 1.001 * np.eye(3), "rotation is no rotation matrix"),
         ("rotation", np.diag([1.0, 1.0, -1.0]), "rotation is no rotation matrix"),

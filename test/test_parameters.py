@@ -52,6 +52,7 @@ def test_given_values_are_taken_and_others_default() -> None:
         ({"count": 1.0}, "'count': 1.0, expected a whole number"),
         ({"count": 0}, "'count': 0, expected 1 to 9"),
         ({"mode": "medium"}, "'mode': 'medium', expected one of fast, slow"),
+        ({"mode": "fsat"}, "'mode': 'fsat', expected one of fast, slow; did you mean 'fast'?"),
         ({"active": 1}, "'active': 1, expected true or false"),
         ({"names": "a"}, "'names': 'a', expected a list of strings"),
         ({"names": ["a", 1]}, "expected a list of strings"),

@@ -275,7 +275,7 @@ def test_invalid_bag_or_bag_without_skeletons_is_refused(capsys: pytest.CaptureF
         ("fusion: {ros__parameters: {silense: 1.0}}", "/fusion: unknown parameter 'silense'; did you mean 'silence'?"),
         ("fusion: {ros__parameters: {silence: 99}}", "/fusion: parameter 'silence': 99, expected 0.02 to 5"),
         ("/**: {ros__parameters: {filtre: x}}", "/**: unknown parameter 'filtre'"),
-        ("fusoin: {ros__parameters: {silence: 1.0}}", "/fusoin: no such node"),
+        ("fusoin: {ros__parameters: {silence: 1.0}}", "; did you mean '/fusion'?"),
         ("fusion: {silence: 1.0}", "holds no ros__parameters"),
         ("fusion: [", "is not YAML"),
         (

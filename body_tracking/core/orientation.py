@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from body_tracking.core.body_model import SEGMENTS
-from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.errors import BodyTrackingError, one_of
 from body_tracking.core.skeleton import FloatArray
 
 SEGMENT_NUMBER: Final = {name: number for number, name in enumerate(SEGMENTS)}
@@ -54,7 +54,7 @@ class SegmentOrientation:
 
     def __post_init__(self) -> None:
         if self.segment not in SEGMENT_NUMBER:
-            raise self._error(f"segment {self.segment!r}, expected one of {', '.join(SEGMENTS)}")
+            raise self._error(f"segment {self.segment!r}, {one_of(self.segment, SEGMENTS)}")
         for name in ("rotation", "covariance"):
             value: FloatArray = getattr(self, name)
             if value.shape != (3, 3):

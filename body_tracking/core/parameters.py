@@ -10,7 +10,6 @@ import math
 import textwrap
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from pathlib import Path
 from types import MappingProxyType
@@ -19,7 +18,7 @@ from typing import Any, TypeAlias
 import yaml
 
 from body_tracking.core import files
-from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.errors import BodyTrackingError, did_you_mean, one_of
 
 Value: TypeAlias = bool | int | float | str | tuple[str, ...]
 
@@ -89,7 +88,7 @@ class Parameter:
             if not low <= checked <= high or (math.isinf(checked) and checked not in (self.min, self.max)):
                 raise ParameterError(f"parameter {self.name!r}: {value!r}, expected {self.constraint or 'finite'}")
         if self.choices and checked not in self.choices:
-            raise ParameterError(f"parameter {self.name!r}: {value!r}, expected one of {self.constraint}")
+            raise ParameterError(f"parameter {self.name!r}: {value!r}, {one_of(checked, self.choices)}")
         return checked
 
     def check_change(self, value: object) -> Value:
@@ -201,9 +200,8 @@ def check_all(table: Sequence[Parameter], given: Mapping[str, object]) -> dict[s
 
 def unknown_parameter(name: str, known: Collection[str]) -> ParameterError:
     """The error for an unknown name, with the most similar known one."""
-    similar = get_close_matches(name, known, n=1)
-    hint = f"did you mean {similar[0]!r}?" if similar else f"known: {', '.join(sorted(known))}"
-    return ParameterError(f"unknown parameter {name!r}; {hint}")
+    hint = did_you_mean(name, known) or f"; known: {', '.join(sorted(known))}"
+    return ParameterError(f"unknown parameter {name!r}{hint}")
 
 
 # --- files

@@ -9,6 +9,7 @@ import importlib
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Final, Protocol, runtime_checkable
 
+from body_tracking.core.errors import one_of
 from body_tracking.pipeline.roles import DEFAULT_FILTER as DEFAULT_FILTER
 
 if TYPE_CHECKING:
@@ -93,7 +94,7 @@ def parameter_classes() -> dict[str, type[Any]]:
 def _row(name: str) -> tuple[str, str, str]:
     if name not in _FILTERS:
         error: type[Exception] = _load("parameters:FilterError")
-        raise error(f"unknown filter {name!r}, expected one of {', '.join(FILTERS)}")
+        raise error(f"unknown filter {name!r}, {one_of(name, FILTERS)}")
     return _FILTERS[name]
 
 

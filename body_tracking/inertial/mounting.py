@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from body_tracking.core.body_model import SEGMENTS
-from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.errors import BodyTrackingError, one_of
 from body_tracking.core.skeleton import FloatArray
 
 _USUAL: Final = {
@@ -40,7 +40,7 @@ def mounting(segment: str, axes: str = "") -> FloatArray:
         MountingError: no such segment, or not two different axes.
     """
     if segment not in SEGMENTS:
-        raise MountingError(f"segment {segment!r}, expected one of {', '.join(SEGMENTS)}")
+        raise MountingError(f"segment {segment!r}, {one_of(segment, SEGMENTS)}")
     mirror = np.ones(3)
     if not axes:
         axes = _USUAL[segment.removesuffix("_left").removesuffix("_right")]

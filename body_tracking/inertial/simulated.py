@@ -29,6 +29,7 @@ from scipy.signal import cont2discrete, lfilter, lfilter_zi
 from body_tracking.core import so3
 from body_tracking.core.body_model import SEGMENTS
 from body_tracking.core.clocks import ClockModel
+from body_tracking.core.errors import one_of
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
 from body_tracking.inertial.mounting import mounting
 from body_tracking.inertial.simulated_driver import Z, fuse, rotate, stated_covariance
@@ -201,7 +202,7 @@ class SimulatedImu:
 
     def __post_init__(self) -> None:
         if self.segment not in SEGMENTS:
-            raise ImuSimulationError(f"{self.name}: segment {self.segment!r}, expected one of {', '.join(SEGMENTS)}")
+            raise ImuSimulationError(f"{self.name}: segment {self.segment!r}, {one_of(self.segment, SEGMENTS)}")
         if not 1.0 <= self.rate_hz <= 1000.0:
             raise ImuSimulationError(f"{self.name}: a rate of {self.rate_hz} Hz, expected 1 to 1000")
 

@@ -22,7 +22,7 @@ import numpy as np
 from body_tracking.calibration.clock_correlation import Series
 from body_tracking.core import so3
 from body_tracking.core.clocks import JUMP_BACK_NS, jumped_back
-from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.errors import BodyTrackingError, one_of
 from body_tracking.core.imu import ImuSample
 from body_tracking.core.orientation import SegmentOrientation
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Skeleton
@@ -131,8 +131,8 @@ class InertialTracker:
         unknown = [name for name in segments if name not in self._model.segment_names]
         if unknown or not segments or len(set(segments)) < len(segments):
             problem = f"unknown: {', '.join(unknown)}" if unknown else "none, or one twice"
-            expected = ", ".join(self._model.segment_names)
-            raise InertialTrackingError(f"segments with inertial sensors: {problem}; expected some of {expected}")
+            expected = one_of(", ".join(unknown), self._model.segment_names)
+            raise InertialTrackingError(f"segments with inertial sensors: {problem}; {expected}")
         self.segments = tuple(segments)
         self._intended = intended_mountings(self.segments, mountings)
         self._world = world

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from typing import Protocol
 
-from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.errors import BodyTrackingError, one_of
 from body_tracking.core.parameters import described_field, number_field
 from body_tracking.core.sources import RecordedFrame
 from body_tracking.kinect.kinect_protocol import DEFAULT_PORT
@@ -110,7 +110,7 @@ def open_source(backend: str, settings: SourceSettings) -> SkeletonSource:
         BodyTrackingError: the backend cannot open its sensor.
     """
     if backend not in backends():
-        raise SourceError(f"unknown backend {backend!r}, expected one of {', '.join(backends())}")
+        raise SourceError(f"unknown backend {backend!r}, {one_of(backend, backends())}")
     opener: Opener
     if backend in _BACKENDS:
         opener = load(_BACKENDS[backend])

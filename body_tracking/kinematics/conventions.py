@@ -34,7 +34,7 @@ from typing import Final
 import numpy as np
 
 from body_tracking.core import so3
-from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.errors import BodyTrackingError, one_of
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.joint_angles import JointAngles
 from body_tracking.core.skeleton import FloatArray, IntArray
@@ -394,7 +394,7 @@ def convention(name: str, model: UpperBody) -> Convention:
 
     builders = dict(zip(CONVENTIONS, (_model, _isb, _rep155, dh26), strict=True))
     if name not in builders:
-        raise ConventionError(f"angle convention {name!r}: not one of {', '.join(CONVENTIONS)}")
+        raise ConventionError(f"angle convention {name!r}, {one_of(name, CONVENTIONS)}")
     return builders[name](model)
 
 

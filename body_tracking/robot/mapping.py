@@ -32,7 +32,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +39,7 @@ import numpy as np
 import yaml
 
 from body_tracking.core import files
-from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.errors import BodyTrackingError, did_you_mean
 from body_tracking.core.parameters import (
     Parameter,
     ParameterError,
@@ -412,5 +411,4 @@ def _text(value: object, what: str) -> str:
 
 
 def _hint(name: str, known: Sequence[str]) -> str:
-    similar = get_close_matches(name, known, n=1)
-    return f"; did you mean {similar[0]!r}?" if similar else f"; known: {', '.join(known)}"
+    return did_you_mean(name, known) or f"; known: {', '.join(known)}"

@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, NoReturn
 import yaml
 
 from body_tracking.core import names
+from body_tracking.core.arguments import Parser
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.extras import pip_install
 from body_tracking.core.parameters import SECTION, Value, to_ros
@@ -521,7 +522,7 @@ def has_sensors(file: Path) -> bool:
     return "ros__parameters" in text and "_skeleton:" in text and ("backend:" in text or "file:" in text)
 
 
-class _Parser(argparse.ArgumentParser):
+class _Parser(Parser):
     def error(self, message: str) -> NoReturn:
         raise UpError(message.removeprefix("argument --"))  # launch has no dashes
 

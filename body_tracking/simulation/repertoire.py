@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from body_tracking.core import so3
-from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.errors import BodyTrackingError, one_of
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.kinematics.trajectories import Moves, Waves, eased, minimum_jerk
 from body_tracking.simulation.exercises import EXERCISES, Exercise, normal
@@ -355,7 +355,7 @@ def make_movement(
         RepertoireError: an unknown name, or too few seconds.
     """
     if name not in MOTIONS:
-        raise RepertoireError(f"unknown motion {name!r}, expected one of {', '.join(MOTIONS)}")
+        raise RepertoireError(f"unknown motion {name!r}, {one_of(name, MOTIONS)}")
     if seconds is not None and not 0.0 < seconds < np.inf:
         raise RepertoireError(f"{name}: {seconds} s")
     return MOTIONS[name](name, person, rng, seconds)

@@ -332,7 +332,7 @@ def test_a_mounting_names_the_directions_of_x_and_z() -> None:
 def test_invalid_segments_and_mountings_are_refused(segments: list[str], given: tuple[str, ...]) -> None:
     with pytest.raises(BodyTrackingError):
         InertialTracker(segments, mountings=given)
-    with pytest.raises(InertialTrackingError, match="unknown: nose; expected some of pelvis, "):
+    with pytest.raises(InertialTrackingError, match="unknown: nose; expected one of pelvis, "):
         InertialTracker(["nose"])
     with pytest.raises(InertialTrackingError, match="no inertial sensor"):
         InertialTracker(["head"]).add("pelvis", ImuSample(0, "a", np.array([0.0, 0.0, 0.0, 1.0])), 0)

@@ -485,7 +485,7 @@ def test_infinite_variances_and_missing_velocities_affect_their_angles_only() ->
 
 def test_unknown_conventions_and_other_previous_angles_raise() -> None:
     now = estimate(MODEL.neutral())
-    with pytest.raises(ConventionError, match="'euler': not one of model, isb, rep155, dh26"):
+    with pytest.raises(ConventionError, match="'euler', expected one of model, isb, rep155, dh26"):
         angles_of(now, MODEL, "euler")
     with pytest.raises(ConventionError, match="previous angles"):
         angles_of(now, MODEL, "isb", angles_of(now, MODEL, "model"))

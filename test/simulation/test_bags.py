@@ -351,6 +351,7 @@ def test_the_shipped_parameters_file_holds_all_errors_at_their_defaults() -> Non
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (("--motion", "torso_twsit"), "did you mean 'torso_twist'?"),
         (("--motion", "hop"), "unknown motion 'hop', expected one of two_handed_wave, "),
         (("--layout", "10"), "layout 10: expected 1 to 9"),
         (("--around=1,x",), "--around 1,x: expected degrees, separated by commas"),
