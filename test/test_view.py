@@ -10,7 +10,9 @@ import pytest
 pytest.importorskip("viser", reason="viser is not installed")
 
 
+from body_tracking.core.message_types import DIAGNOSTICS as DIAGNOSTICS_TYPE
 from body_tracking.core.message_types import JOINT_STATE, POINT_CLOUD, STRING
+from body_tracking.core.names import DIAGNOSTICS
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter
 from body_tracking.ros import view
 from body_tracking.viewing.start_page import Recording
@@ -18,11 +20,15 @@ from body_tracking.viewing.start_page import Recording
 BAGS = Path(__file__).resolve().parents[1] / "bags"
 
 
-def described(bag: Path) -> Recording:
-    """The recording's entry in the list."""
+def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser()
     view.add_parser(parser.add_subparsers())
-    found = view._described(parser.parse_args(["view"]), bag, "here")
+    return parser.parse_args(["view"])
+
+
+def described(bag: Path) -> Recording:
+    """The recording's entry in the list."""
+    found = view._described(arguments(), bag, "here")
     assert isinstance(found, Recording)
     return found
 
@@ -59,3 +65,18 @@ def test_a_recording_of_angles_is_labelled_as_results(tmp_path: Path) -> None:
     assert "body_tracking show" in found.refusal
     found = described(written(tmp_path / "both", {**angles, "/kinect1/skeleton": POINT_CLOUD}))
     assert found.content == "0.0 s, results (angles of body1), sensors kinect1" and not found.refusal
+    found = described(
+        written(tmp_path / "live", {**angles, "/kinect1/skeleton": POINT_CLOUD, DIAGNOSTICS: DIAGNOSTICS_TYPE})
+    )
+    assert found.content == "0.0 s, angles of body1, sensors kinect1" and not found.refusal
+
+
+def test_recordings_and_examples_come_before_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    measured, angles = {"/kinect1/skeleton": POINT_CLOUD}, {"/humans/bodies/body1/joint_states": JOINT_STATE}
+    written(Path("session"), {**measured, **angles, DIAGNOSTICS: DIAGNOSTICS_TYPE})
+    written(Path("replayed"), {**measured, **angles})
+    written(Path("only_angles"), angles)
+    first, *examples, replayed, refused = (each.path.name for each in view._recordings(arguments(), {}))
+    assert (first, replayed, refused) == ("session", "replayed", "only_angles")
+    assert examples[0].startswith("tpose")

@@ -11,7 +11,7 @@ import os
 import queue
 import signal
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
@@ -141,7 +141,7 @@ def _choose(
         looked, found = 0.0, Domain()
         while True:
             if time.monotonic() - looked > _FOLDER_S:
-                page.draw_recordings(list(_recordings(args, known)))
+                page.draw_recordings(_recordings(args, known))
                 looked = time.monotonic()
             try:
                 choice = chosen.get(timeout=_PERIOD_S)
@@ -166,19 +166,21 @@ def _absent() -> str:
     )
 
 
-def _recordings(args: argparse.Namespace, known: dict[Path, Any]) -> Iterator[Any]:
-    """The recordings of the folder, then those that come with the package, each once."""
-    seen: set[Path] = set()
+def _recordings(args: argparse.Namespace, known: dict[Path, Any]) -> list[Any]:
+    """The recordings of the folder, then those that come with the package, each once; last results, and what cannot be
+    played.
+    """
+    seen: dict[Path, Any] = {}
     for own, bags in ((True, bags_in(Path())), (False, shipped_bags())):
         for bag in bags:
             path = bag.resolve()
             if path in seen:
                 continue
-            seen.add(path)
             if path not in known:
                 place = "this folder" if bag.parent == Path() else str(bag.parent)
                 known[path] = _described(args, bag, f"in {place}" if own else "an example")
-            yield known[path]
+            seen[path] = known[path]
+    return sorted(seen.values(), key=lambda each: (bool(each.refusal), each.results))
 
 
 def _described(args: argparse.Namespace, bag: Path, where: str) -> Any:
@@ -192,8 +194,9 @@ def _described(args: argparse.Namespace, bag: Path, where: str) -> Any:
     except BodyTrackingError as error:
         return Recording(bag, where, "cannot be read", str(error).replace(f"{bag}/", ""))
     bodies = graph.bodies_among(types)
+    results = bool(bodies) and graph.DIAGNOSTICS_TOPIC not in types  # which every live recording has
     if bodies:
-        length += f", results (angles of {listed(bodies)})"
+        length += f", results (angles of {listed(bodies)})" if results else f", angles of {listed(bodies)}"
     try:
         options = options_for(_graph(args, Choice(bag, False, DEFAULT)))
     except NoSourceError as error:
@@ -208,7 +211,7 @@ def _described(args: argparse.Namespace, bag: Path, where: str) -> Any:
     skeletons = {"sensors": options["sensors"]} if options["sensors"] and not options["computed"] else {}
     others = unused(types, options)
     also = f"; also in it, for {others}" if others else ""
-    return Recording(bag, where, f"{length}, {_in_words({**skeletons, **sources})}{also}")
+    return Recording(bag, where, f"{length}, {_in_words({**skeletons, **sources})}{also}", results=results)
 
 
 def _in_words(sources: Mapping[str, Value]) -> str:

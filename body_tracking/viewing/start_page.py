@@ -29,12 +29,14 @@ class Recording:
         where: in words, such as "in this folder".
         content: its length and sensors in words.
         refusal: reason why it cannot be played, or empty.
+        results: whether its angles were computed offline, from another recording.
     """
 
     path: Path
     where: str
     content: str
     refusal: str = ""
+    results: bool = False
 
 
 @dataclass(frozen=True, slots=True)
