@@ -33,9 +33,12 @@ NEEDED = ("filterpy", "vqf", "mcap", "lz4", "zstandard", "rosbags")
 OPTIONAL = {
     "viser": ("no live page", pip_install("viewer")),
     "ezc3d": ("no import of C3D files", pip_install("c3d")),
-    "tf2_msgs": ("no /tf, so no frames in RViz", "where ROS is installed: sudo apt install ros-jazzy-tf2-msgs"),
-    "hri_msgs": ("no /humans/bodies/tracked (REP-155)", "where ROS is installed: sudo apt install ros-jazzy-hri-msgs"),
 }
+OF_ROS = {
+    "tf2_msgs": ("no /tf, so no frames in RViz", "sudo apt install ros-jazzy-tf2-msgs"),
+    "hri_msgs": ("no /humans/bodies/tracked (REP-155)", "sudo apt install ros-jazzy-hri-msgs"),
+}
+"""Message packages that only a ROS install can have."""
 _RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 _FAST_DDS = ("FASTDDS_BUILTIN_TRANSPORTS", "FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 _REMEDIES = {
@@ -70,6 +73,9 @@ def environment(variables: Mapping[str, str]) -> Iterator[Finding]:
     reach = "LOCALHOST" if variables.get("ROS_LOCALHOST_ONLY") == "1" else variables.get(_RANGE) or "SUBNET"
     if reach not in ("SUBNET", "LOCALHOST", "SYSTEM_DEFAULT"):
         yield Finding(PROBLEM, f"{_RANGE} is {reach!r}: nodes do not find each other", f"export {_RANGE}=SUBNET")
+    elif not several_machines(variables) and reach == "SUBNET":
+        others = "body_tracking up stays on this machine, other nodes reach the network"
+        yield Finding(OK, f"ROS domain {domain}, discovery range not set: {others}")
     else:
         peers = variables.get("ROS_STATIC_PEERS") or ("none" if reach == "LOCALHOST" else "those of the network")
         yield Finding(OK, f"ROS domain {domain}, discovery range {reach}, other machines: {peers}")
@@ -90,23 +96,29 @@ def client_library() -> Finding:
     return Finding(PROBLEM, f"no ROS node can be made: {reason}", remedy)
 
 
-def libraries() -> Iterator[Finding]:
+def several_machines(variables: Mapping[str, str]) -> bool:
+    """Whether the user chose that nodes find those of other machines."""
+    return variables.get(_RANGE) in ("SUBNET", "SYSTEM_DEFAULT") or bool(variables.get("ROS_STATIC_PEERS"))
+
+
+def libraries(variables: Mapping[str, str]) -> Iterator[Finding]:
     """Libraries that are not installed."""
     missing = [name for name in NEEDED if find_spec(name) is None]
     if missing:
         yield Finding(PROBLEM, f"not installed: {', '.join(missing)}", f"pip install {' '.join(missing)}")
-    for name, (lack, remedy) in OPTIONAL.items():
+    for name, (lack, remedy) in (OPTIONAL | (OF_ROS if variables.get("ROS_DISTRO") else {})).items():
         if find_spec(name) is None:
             yield Finding(WARNING, f"{name} is not installed: {lack}", remedy)
 
 
-def clock() -> Finding:
+def clock(variables: Mapping[str, str]) -> Finding:
     """The real-time clock, which stamps messages."""
     if time.time() < Path(__file__).stat().st_mtime:
         return Finding(PROBLEM, f"the clock is in the past: {time.ctime()}", "sudo timedatectl set-ntp true")
     if ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(1024)) == 5:  # TIME_ERROR
-        remedy = "sudo timedatectl set-ntp true, where sensors are on several machines"
-        return Finding(WARNING, "the clock is not synchronised", remedy)
+        if not several_machines(variables):
+            return Finding(OK, "the clock is not synchronised, as only sensors on several machines need it")
+        return Finding(WARNING, "the clock is not synchronised", "sudo timedatectl set-ntp true, on every machine")
     return Finding(OK, "the clock is synchronised")
 
 
@@ -140,7 +152,7 @@ def bag(path: Path) -> Iterator[Finding]:
     }
     if not sensors and others:
         found = f"no skeletons on /<sensor>/skeleton, but {', '.join(others)}"
-        yield Finding(WARNING, f"{path}: {found}", advice_for(others))
+        yield Finding(WARNING, f"{path}: {found}", advice_for(others, "up or replay"))
     elif not sensors:
         found = f"no skeletons on /<sensor>/skeleton; topics: {', '.join(topic.name for topic in info.topics)}"
         yield Finding(PROBLEM, f"{path}: {found}", "record the sensors' topics; docs/recordings.md has other formats")
@@ -167,8 +179,8 @@ def examine(args: argparse.Namespace) -> Iterator[Finding]:
         yield from bag(args.bag)
         return
     yield from environment(os.environ)
-    yield clock()
-    needed = [*libraries(), client_library()]
+    yield clock(os.environ)
+    needed = [*libraries(os.environ), client_library()]
     yield from needed
     if all(each.level != PROBLEM for each in needed):
         from body_tracking.ros.doctor_live import domain

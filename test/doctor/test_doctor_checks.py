@@ -27,7 +27,8 @@ def worst(findings: Iterable[Finding]) -> tuple[str, str]:
 @pytest.mark.parametrize(
     ("variables", "level", "reported"),
     [
-        ({}, OK, "ROS domain 0, discovery range SUBNET, other machines: those of the network"),
+        ({}, OK, "ROS domain 0, discovery range not set: body_tracking up stays on this machine"),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, OK, "range SUBNET, other machines: those of the network"),
         ({"ROS_DOMAIN_ID": "7", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}, OK, "7, discovery range LOCALHOST"),
         ({"ROS_STATIC_PEERS": "10.0.0.2"}, OK, "other machines: 10.0.0.2"),
         ({"ROS_DOMAIN_ID": "lab"}, PROBLEM, "'lab'"),
@@ -45,16 +46,21 @@ def test_variables_that_separate_nodes_are_named(variables: dict[str, str], leve
 
 
 def test_missing_libraries_come_with_the_line_that_installs_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "OPTIONAL", {"numpy": ("", ""), "absent_too": ("no page", "sudo apt install x")})
-    assert list(doctor.libraries()) == [Finding(WARNING, "absent_too is not installed: no page", "sudo apt install x")]
+    monkeypatch.setattr(doctor, "OPTIONAL", {"numpy": ("", ""), "absent_too": ("no page", "pip install x")})
+    monkeypatch.setattr(doctor, "OF_ROS", {"absent_msgs": ("no frames", "sudo apt install x")})
+    found = Finding(WARNING, "absent_too is not installed: no page", "pip install x")
+    assert list(doctor.libraries({})) == [found]  # pip has no message packages of ROS
+    of_ros = Finding(WARNING, "absent_msgs is not installed: no frames", "sudo apt install x")
+    assert list(doctor.libraries({"ROS_DISTRO": "jazzy"})) == [found, of_ros]
     monkeypatch.setattr(doctor, "NEEDED", ("mcap", "absent"))
-    assert next(doctor.libraries()) == Finding(PROBLEM, "not installed: absent", "pip install absent")
+    assert next(doctor.libraries({})) == Finding(PROBLEM, "not installed: absent", "pip install absent")
 
 
 def test_a_clock_in_the_past_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert doctor.clock().level in (OK, WARNING)  # this machine's may be synchronised or not
+    assert doctor.clock({}).level == OK  # synchronised or not, it is the only one
+    assert doctor.clock({"ROS_STATIC_PEERS": "10.0.0.2"}).level in (OK, WARNING)
     monkeypatch.setattr(doctor.time, "time", lambda: 0.0)
-    assert doctor.clock().level == PROBLEM
+    assert doctor.clock({}).level == PROBLEM
 
 
 def test_a_bag_that_was_cut_off_is_played_in_part(tmp_path: Path) -> None:
