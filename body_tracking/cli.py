@@ -16,6 +16,9 @@ from body_tracking.core.errors import BodyTrackingError
 if TYPE_CHECKING:
     from body_tracking.pipeline.system import Command
 
+_FIRST = ("view", "up", "replay", "show", "calibrate", "doctor")
+"""Commands that come first in the help: those of a first session."""
+
 
 def subcommands() -> dict[str, Command]:
     """The subcommands by name; their modules are not loaded."""
@@ -39,8 +42,8 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
     if command in commands:
         importlib.import_module(commands[command].module).add_parser(subparsers)
     else:
-        for each in commands.values():
-            subparsers.add_parser(each.name, help=each.text)
+        for name in dict.fromkeys((*_FIRST, *sorted(commands))):
+            subparsers.add_parser(name, help=commands[name].text)
     return top
 
 

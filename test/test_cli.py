@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import pytest
 
 from body_tracking import cli
+from body_tracking.core.message_types import JOINT_STATE
 from body_tracking.recording.rosbag2 import BagWriter
 from body_tracking.ros import advice
 
@@ -48,6 +49,10 @@ def test_without_a_command_it_says_what_to_do_next(nobody: Path, capsys: pytest.
     text = said()
     assert "Recordings in this folder: bags/mine." in text
     assert "  body_tracking up --bag bags/mine" in text and "  body_tracking replay bags/mine -o mine_angles" in text
+    with BagWriter(nobody / "session") as writer:
+        writer.add_topic("/humans/bodies/body1/joint_states", JOINT_STATE)
+    assert "Recordings in this folder: session, bags/mine." in (text := said())
+    assert "  body_tracking show session\n  body_tracking up --bag session" in text
     (nobody / "lab.yaml").write_text("kinect1_skeleton: {ros__parameters: {backend: network}}")
     assert "  body_tracking up --params-file lab.yaml" in said()
 

@@ -123,12 +123,12 @@ def run(args: argparse.Namespace) -> int:
     tracked = read(args.bag, args.body, args.truth)
     table = summary(tracked.angles, tracked.true_angles)
     width = shutil.get_terminal_size((120, 24)).columns
-    print(f"{table.text(width)}\n\n{table.note}", flush=True)  # drawing takes seconds
+    print(f"{table.text(width)}\n\n{table.note}\n", flush=True)  # drawing takes seconds
     if args.csv is not None:
         write_csv(tracked.angles, args.csv)
-        print(f"\nangles: {args.csv}")
+        print(f"angles: {args.csv}")
     if args.output is not None:
         make_folder(args.output)
         draw(tracked, args.output)
-        print(f"\npicture: {args.output}")
+        print(f"picture: {args.output}")
     return 0

@@ -47,7 +47,7 @@ def _poses(bag: BagReader) -> Iterator[str]:
         x, y, z = pose.translation
         ahead = pose.rotation[:, 2]
         if not pose.translation.any() and np.allclose(ahead, [1.0, 0.0, 0.0]):
-            yield f"{sensor}: the reference sensor; world begins at it, with x where it looks and z upwards"
+            yield f"{sensor}: the reference sensor, at the origin of world, whose x is where it looks and z is up"
             continue
         left, down = np.round(np.degrees([np.arctan2(ahead[1], ahead[0]), np.arcsin(np.clip(-ahead[2], -1.0, 1.0))]))
         tilt = f"{abs(down):.0f} deg {'up' if down < 0.0 else 'down'}" if down else "level"
@@ -80,12 +80,11 @@ def _angles(bag: BagReader, body: str) -> Iterator[str]:
             else:
                 medians.append(float(np.median(known)))
                 shares[label_of(name)] = 100.0 * len(known) / len(stddevs)
-        text = f"{body}, {limb}: {len(medians)} of {len(names_of_limb)} angles with a standard deviation below "
-        text += f"{UNKNOWN:.0f} deg"
+        text = f"{body}, {limb}: {len(medians)} of {len(names_of_limb)} angles known"
         if medians:
             size = " to ".join(dict.fromkeys((f"{min(medians):.1f}", f"{max(medians):.1f}")))
             least = min(shares, key=lambda name: shares[name])
             rare = f" ({least} least often)" if round(shares[least]) < round(max(shares.values())) else ""
             share = f"at least {shares[least]:.0f} % of the frames" if shares[least] < 99.5 else "every frame"
-            text += f", each in {share}{rare}; median {size} deg"
-        yield text + (f"; not {', '.join(unknown)}" if unknown else "")
+            text += f" in {share}{rare}: standard deviation below {UNKNOWN:.0f} deg, median {size} deg"
+        yield text + (f"; not known: {', '.join(unknown)}" if unknown else "")

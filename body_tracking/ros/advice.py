@@ -9,6 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Final, TypeAlias
 
+from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.extras import pip_install
 from body_tracking.ros import dds
 from body_tracking.ros.up import flags, has_sensors
@@ -83,15 +84,29 @@ def _recordings(folder: Path, page: str, *, live: bool) -> Iterator[Step]:
     names = [str(_short(each, folder)) if own else each.name for each in bags[:_SHOWN]]
     more = f" and {len(bags) - _SHOWN} more" if len(bags) > _SHOWN else ""
     first = _short(bags[0], folder)
-    commands = [f"body_tracking up --bag {first}{page}"] if live else []
+    shown = own and _holds_angles(bags[0])
+    commands = [f"body_tracking show {first}"] if shown else []
+    commands += [f"body_tracking up --bag {first}{page}"] if live else []
     out = f"{first.stem}_angles"
     yield (
-        f"Recordings {where}: {', '.join(names)}{more}. Play one, or compute its angles offline:",
+        f"Recordings {where}: {', '.join(names)}{more}. "
+        f"{'Show the angles of one, play it' if shown else 'Play one'}, or compute its angles offline:",
         (
             *commands,
             f"body_tracking replay {first} -o {out}",
         ),
     )
+
+
+def _holds_angles(bag: Path) -> bool:
+    from body_tracking.pipeline.graph import bodies_among
+    from body_tracking.recording.rosbag2 import BagReader
+
+    try:
+        with BagReader(bag) as reader:
+            return bool(bodies_among(reader.topics))
+    except BodyTrackingError:
+        return False
 
 
 def _short(bag: Path, folder: Path) -> Path:

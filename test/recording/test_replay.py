@@ -300,7 +300,7 @@ def test_images_of_a_camera_become_angles(tmp_path: Path) -> None:
 
 def test_the_summary_of_a_replay_has_poses_and_known_angles(replayed_wave: Path, extended_wave: Path) -> None:
     lines = list(summary(replayed_wave))
-    assert lines[0].startswith("kinect1: the reference sensor; world begins at it")
+    assert lines[0].startswith("kinect1: the reference sensor, at the origin of world")
     assert "looks 87 deg to the right of x" in lines[1] or "looks 88 deg to the right of x" in lines[1]
     assert [line.partition(":")[0] for line in lines[1:]] == [
         "kinect2",
@@ -308,13 +308,13 @@ def test_the_summary_of_a_replay_has_poses_and_known_angles(replayed_wave: Path,
     ]
     assert all(
         re.search(
-            r"[1-9] of \d angles with a standard deviation below 30 deg, each in (at least \d|every).*; median \d",
+            r"[1-9] of \d angles known in (at least \d|every).*: standard deviation below 30 deg, median \d",
             line,
         )
         for line in lines[2:]
     )
     # an angle with the prior's deviation counts as unknown
-    assert any("; not left" in line for line in summary(extended_wave))
+    assert any("; not known: left" in line for line in summary(extended_wave))
 
 
 def test_a_replay_names_its_filter_and_that_of_the_recorded_graph(tmp_path: Path, command: Command) -> None:
