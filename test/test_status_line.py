@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import pty
+import sys
 import time
 from collections import deque
 from pathlib import Path
@@ -13,6 +16,7 @@ pytest.importorskip("rclpy", reason="ROS is not installed")
 from body_tracking.messages.node_status import NodeStatus
 from body_tracking.pipeline.system import Options
 from body_tracking.ros.graph_monitor import GraphMonitor, calibration_part, losses_part, problem_parts
+from body_tracking.ros.up import Console
 from body_tracking.systems import options_of
 
 
@@ -93,6 +97,33 @@ def test_a_bag_that_waits_names_the_nodes_that_it_waits_for() -> None:
     assert not monitor.has_subscribers({}, ["fusion", "joint_angles"])
     line = monitor.line(options_of(sensors=("kinect1",), bag="arm"), 1.0, {})
     assert line.strip() == "1.0 s (the bag plays once all nodes have started: fusion, joint_angles)"
+
+
+def test_a_narrow_terminal_shows_the_whole_status_over_several_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    master, terminal = pty.openpty()
+    with os.fdopen(terminal, "w") as stdout:
+        monkeypatch.setattr(sys, "stdout", stdout)
+        console = Console()
+        console.status("12.3 s | kinect1 28, fused 28, angles 28 Hz | calibration: waiting for a still pose")
+        console.line("a line above")
+        console.end()
+        console.line("the end")
+        text = os.read(master, 10_000).decode()
+    os.close(master)
+    drawn, above, again = (
+        text.partition("\r\x1b[2A\x1b[J")[0],
+        "a line above\r\n",
+        text.rpartition("above\r\n")[2].removesuffix("\r\nthe end\r\n"),
+    )
+    assert drawn == again and above in text
+    assert [len(line) < 40 for line in drawn.split("\r\n")] == [True] * 3
+    assert " ".join(drawn.split()).endswith("calibration: waiting for a still pose")
+
+
+def test_until_a_node_reports_the_line_says_that_they_start() -> None:
+    line = monitor_without_node().line(options_of(sensors=("kinect1",), external=True), 1.0, {})
+    assert line.startswith("   1.0 s (the nodes are starting) | kinect1 -")
 
 
 def test_a_sensor_that_never_sends_is_named() -> None:

@@ -13,7 +13,7 @@ APART: Final = "do not see the same pose"
 _NEXT: Final = {
     WAITING: "hold a T-pose (arms straight, level and sideways) for four seconds where all sensors see you",
     ROUGH: "walk about and turn where all sensors see you",
-    APART: "be alone in view, and face all sensors in a T-pose: one sees another person, or takes back for front",
+    APART: "be alone in view, and turn your front to each sensor: one sees another person, or takes back for front",
 }
 """By a part of the text of the status."""
 

@@ -100,8 +100,9 @@ SLEW_ROTATION, SLEW_TRANSLATION = 0.05, 0.05
 MAX_TRANSLATION_STDDEV = 0.05
 """Metres, at the person's place: greatest standard deviation of a good calibration."""
 
-MAX_RESIDUAL = 0.15
-"""Metres: greatest median residual of a good calibration; nine real pairs of Kinects have 0.03 to 0.11."""
+MAX_RESIDUAL = 0.3
+"""Metres: greatest median residual of a good calibration. Nine real pairs of Kinects have 0.03 to 0.11, a simulated
+sensor behind the person 0.21 to 0.23, sensors that see different people 0.57."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -320,7 +320,7 @@ def stream(sender: Sender, source: Any) -> None:
             silent_at = now + SILENT_PERIOD
         if now - last >= STATUS_PERIOD:
             last = now
-            bodies = "the sensor is silent" if frame is None else f"{len(frame.bodies)} bodies"
+            bodies = "the sensor is silent" if frame is None else f"bodies in the last one: {len(frame.bodies)}"
             asked = (
                 f"answered {sender.answered} clock requests" if sender.answered else "the receiver has not asked yet"
             )

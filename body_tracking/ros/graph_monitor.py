@@ -213,6 +213,8 @@ class GraphMonitor:
         else:
             if player is not None:
                 parts[0] += f" (bag {position:.1f}/{player.number('duration s') or 0.0:.1f} s)"
+            elif not fresh:
+                parts[0] += " (the nodes are starting)"
             parts.append(self._rates(options, fresh))
             delay = self._delay(options, fresh)
             if delay:

@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import textwrap
 import threading
 import time
 from collections import deque
@@ -235,27 +236,29 @@ class Child:
 
 
 class Console:
-    """One status line at the bottom of a terminal, and lines above it; plain lines where there is no terminal."""
+    """A status at the bottom of a terminal, and lines above it; plain lines where there is no terminal."""
 
     def __init__(self) -> None:
         self._terminal = sys.stdout.isatty()
         self._lock = threading.Lock()
         self._status = ""
+        self._drawn = 0
+        """Lines of the status that are on the terminal."""
         self._last = time.monotonic()
 
     def line(self, text: str, *, error: bool = False) -> None:
         """Print a line above the status line."""
         with self._lock:
-            if self._terminal and self._status:
-                print("\r\x1b[K", end="", flush=True)
+            self._erase()
             print(text, file=sys.stderr if error else sys.stdout, flush=True)
             self._draw()
 
     def status(self, text: str) -> None:
-        """Replace the status line; without a terminal, print it every :data:`LINE_PERIOD`."""
+        """Replace the status; without a terminal, print it every :data:`LINE_PERIOD`."""
         with self._lock:
             if self._terminal:
                 self._status = text
+                self._erase()
                 self._draw()
             elif time.monotonic() - self._last >= LINE_PERIOD:
                 self._last = time.monotonic()
@@ -266,12 +269,19 @@ class Console:
         with self._lock:
             if self._terminal and self._status:
                 print(flush=True)
-            self._status = ""
+            self._status, self._drawn = "", 0
 
     def _draw(self) -> None:
         if self._terminal and self._status:
-            width = shutil.get_terminal_size().columns - 1
-            print(f"\r\x1b[K{self._status[:width]}", end="", flush=True)
+            lines = textwrap.wrap(self._status, shutil.get_terminal_size().columns - 1, subsequent_indent=" " * 9)
+            print("\n".join(lines), end="", flush=True)
+            self._drawn = len(lines)
+
+    def _erase(self) -> None:
+        if self._drawn:
+            up = f"\x1b[{self._drawn - 1}A" if self._drawn > 1 else ""
+            print(f"\r{up}\x1b[J", end="", flush=True)
+            self._drawn = 0
 
 
 class Supervisor:
