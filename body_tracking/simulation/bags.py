@@ -20,19 +20,23 @@ import numpy as np
 from body_tracking.core.message_types import IMU, JOINT_STATE, MAGNETIC_FIELD, POINT_CLOUD, TIME_REFERENCE, TRANSFORM
 from body_tracking.core.qos import LATCHED, RELIABLE, SENSOR_DATA, Qos
 from body_tracking.core.skeleton import NANOSECONDS
-from body_tracking.inertial.simulated import ImuSamples, SimulatedImu, usual_mounting
+from body_tracking.inertial.simulated import SimulatedImu, usual_mounting
 from body_tracking.kinect.simulated import KinectErrors, read_errors
-from body_tracking.kinematics.positional import positional_angles
-from body_tracking.messages.angles import angles_to_joint_state
 from body_tracking.messages.calibration import clock_to_time_reference, pose_to_transform
 from body_tracking.messages.cdr import encode_skeletons
-from body_tracking.messages.imus import imu_to_message, magnetic_field_to_message
-from body_tracking.messages.model import estimate_to_joint_state
 from body_tracking.pipeline import graph
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter, check_new_bag, serialize
 from body_tracking.simulation import camera_bags, depth_bags, five_systems, marker_bags
 from body_tracking.simulation.layouts import Layout, around, layout
+from body_tracking.simulation.messages import (
+    Message,
+    imu_messages,
+    imu_topic,
+    mag_topic,
+    print_bag,
+    truth_messages,
+)
 from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.repertoire import MOTIONS
 from body_tracking.simulation.scene import (
@@ -55,9 +59,6 @@ SHIPPED: dict[str, str] = {
 }
 """The recordings in ``bags/`` and their motions, those of the thesis."""
 SEED = 20170512
-
-_Message = tuple[int, str, bytes]
-"""Log time, topic, serialised message."""
 
 
 def shipped(name: str, seed: int = SEED) -> Setup:
@@ -82,9 +83,9 @@ def write_bag(recording: SimulatedRecording, folder: Path, *, overwrite: bool = 
     for sensor in recording.sensors:
         topics[graph.skeleton_topic(sensor.pose.sensor)] = POINT_CLOUD, SENSOR_DATA
     for imu, _ in recording.imus:
-        topics[_imu_topic(imu)] = IMU, SENSOR_DATA
+        topics[imu_topic(imu)] = IMU, SENSOR_DATA
         if imu.magnetometer:
-            topics[_mag_topic(imu)] = MAGNETIC_FIELD, SENSOR_DATA
+            topics[mag_topic(imu)] = MAGNETIC_FIELD, SENSOR_DATA
     topics[graph.TRUE_SKELETON] = POINT_CLOUD, SENSOR_DATA
     topics[graph.TRUE_MODEL_STATE] = JOINT_STATE, SENSOR_DATA
     topics[graph.TRUE_ANGLES] = JOINT_STATE, RELIABLE
@@ -100,15 +101,7 @@ def write_bag(recording: SimulatedRecording, folder: Path, *, overwrite: bool = 
         progress.end()
 
 
-def _imu_topic(imu: SimulatedImu) -> str:
-    return f"/{imu.name}/imu/{'data' if imu.oriented else 'data_raw'}"
-
-
-def _mag_topic(imu: SimulatedImu) -> str:
-    return f"/{imu.name}/imu/mag"
-
-
-def _messages(recording: SimulatedRecording) -> Iterator[_Message]:
+def _messages(recording: SimulatedRecording) -> Iterator[Message]:
     """All messages, unordered."""
     for sensor in recording.sensors:
         transform = pose_to_transform(sensor.pose, WORLD, BAG_MESSAGES)
@@ -116,47 +109,18 @@ def _messages(recording: SimulatedRecording) -> Iterator[_Message]:
     for frame in recording.frames:
         yield frame.received_ns, graph.skeleton_topic(frame.sensor), encode_skeletons(frame.skeletons)
     for imu, samples in recording.imus:
-        yield from _imu_messages(imu, samples)
+        yield from imu_messages(imu, samples)
     yield from _truth(recording)
 
 
-def _imu_messages(imu: SimulatedImu, samples: ImuSamples) -> Iterator[_Message]:
-    for k, (stamp_ns, received_ns) in enumerate(
-        zip(samples.stamps_ns.tolist(), samples.received_ns.tolist(), strict=True)
-    ):
-        message = imu_to_message(
-            stamp_ns,
-            f"{imu.name}_link",
-            samples.angular_velocity[k],
-            samples.linear_acceleration[k],
-            None if samples.orientation is None else samples.orientation[k],
-            (
-                samples.orientation_covariance[k],
-                samples.angular_velocity_covariance,
-                samples.linear_acceleration_covariance,
-            ),
-            BAG_MESSAGES,
-        )
-        yield received_ns, _imu_topic(imu), serialize(message)
-        if samples.magnetic_field is not None:
-            field = magnetic_field_to_message(
-                stamp_ns, f"{imu.name}_link", samples.magnetic_field[k], samples.magnetic_field_covariance, BAG_MESSAGES
-            )
-            yield received_ns, _mag_topic(imu), serialize(field)
-
-
-def _truth(recording: SimulatedRecording) -> Iterator[_Message]:
+def _truth(recording: SimulatedRecording) -> Iterator[Message]:
     first = recording.truths[0]
     due_ns = int(first.stamps_ns[0])
     for k, stamp_ns in enumerate(first.stamps_ns.tolist()):
         log_ns = RECEIVED_FROM_NS + stamp_ns - START_NS
-        skeletons = [truth.skeleton(k, body) for body, truth in enumerate(recording.truths)]
         # positions only, as from a sensor
-        yield log_ns, graph.TRUE_SKELETON, encode_skeletons([replace(each, velocities=None) for each in skeletons])
-        state = estimate_to_joint_state(first.estimate(k), MODEL, BAG_MESSAGES)
-        yield log_ns, graph.TRUE_MODEL_STATE, serialize(state)
-        angles = angles_to_joint_state(positional_angles(skeletons[0]), graph.DEFAULT_BODY, WORLD, BAG_MESSAGES)
-        yield log_ns, graph.TRUE_ANGLES, serialize(angles)
+        skeletons = [replace(each.skeleton(k, body), velocities=None) for body, each in enumerate(recording.truths)]
+        yield from truth_messages(skeletons, first.estimate(k), log_ns)
         if stamp_ns >= due_ns:
             due_ns += NANOSECONDS
             for sensor in recording.sensors[1:]:
@@ -326,8 +290,7 @@ def make_bags(args: argparse.Namespace) -> int:
 
 
 def _print_summary(recording: SimulatedRecording, folder: Path) -> None:
-    size = sum(path.stat().st_size for path in folder.iterdir())
     count = sum(len(samples.stamps_ns) for _, samples in recording.imus)
     inertial = f", {count} inertial samples" if count else ""
     said = f"{recording.setup.motion}, {recording.duration:.1f} s, {len(recording.frames)} frames{inertial}"
-    print(f"{folder}: {said}, {size / 1e6:.2f} MB")
+    print_bag(folder, said)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from body_tracking.messages.points import points_to_pose_array
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, BagWriter, serialize
 from body_tracking.simulation.baseline_scenes import ArmScene, PendulumScene
+from body_tracking.simulation.messages import IMAGE_CHUNK_BYTES, print_bag
 
 CAMERA: Final = "camera1"
 START_NS: Final = 1_750_000_000 * NANOSECONDS
@@ -47,7 +48,6 @@ _DELAY_NS: Final = 30_000_000
 """Least time from the capture of an image to its receipt."""
 _LEAD: Final = 0.8
 """Longest recording before the robot's motion begins, seconds."""
-_CHUNK_BYTES: Final = 32 << 20
 
 
 class BaselineError(BodyTrackingError):
@@ -89,7 +89,7 @@ def write_arm(
     }
     seconds = scene.seconds + lead
     robot = np.arange(round((seconds + 1.0) * _ROBOT_RATE)) / _ROBOT_RATE - 0.5
-    with BagWriter(folder, overwrite=overwrite, chunk_bytes=_CHUNK_BYTES, flush_interval_s=float("inf")) as bag:
+    with BagWriter(folder, overwrite=overwrite, chunk_bytes=IMAGE_CHUNK_BYTES, flush_interval_s=float("inf")) as bag:
         for topic, (kind, qos) in topics.items():
             bag.add_topic(topic, kind, qos)
         _write_info(bag, names.colour_info, scene.colour)
@@ -125,7 +125,7 @@ def write_pendulum(
     rng = np.random.default_rng([scene.seed, 62])
     infrared, depth = infrared_topic(camera), DRIVERS["plain"].of(camera).depth
     own = replace(scene.camera, frame_id=optical_frame(camera))
-    with BagWriter(folder, overwrite=overwrite, chunk_bytes=_CHUNK_BYTES, flush_interval_s=float("inf")) as bag:
+    with BagWriter(folder, overwrite=overwrite, chunk_bytes=IMAGE_CHUNK_BYTES, flush_interval_s=float("inf")) as bag:
         for topic in (infrared, depth):
             bag.add_topic(topic, IMAGE, IMAGES)
         bag.add_topic(info_beside(infrared), CAMERA_INFO, LATCHED)
@@ -192,7 +192,7 @@ def _arm(args: argparse.Namespace) -> int:
         folder = args.output / f"trial{number + 1}"
         scene = ArmScene(seed=args.seed * 1000 + number, width=args.width)
         write_arm(scene, folder, args.delay, overwrite=args.overwrite)
-        _print(folder, f"{scene.seconds:.1f} s of motion, stamps {1e3 * args.delay:.0f} ms late")
+        print_bag(folder, f"{scene.seconds:.1f} s of motion, stamps {1e3 * args.delay:.0f} ms late")
     return 0
 
 
@@ -211,10 +211,5 @@ def _pendulum(args: argparse.Namespace) -> int:
         write_pendulum(
             PendulumScene(length, seed=args.seed * 1000 + number), folder, args.seconds, overwrite=args.overwrite
         )
-        _print(folder, f"{args.seconds:g} s of a pendulum of {length:g} m")
+        print_bag(folder, f"{args.seconds:g} s of a pendulum of {length:g} m")
     return 0
-
-
-def _print(folder: Path, what: Any) -> None:
-    size = sum(path.stat().st_size for path in folder.iterdir())
-    print(f"{folder}: {what}, {size / 1e6:.1f} MB")

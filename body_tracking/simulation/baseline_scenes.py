@@ -21,6 +21,7 @@ from body_tracking.core.camera import Camera
 from body_tracking.core.imu import STANDARD_GRAVITY
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray, SingleArray
+from body_tracking.kinematics.trajectories import minimum_jerk
 from body_tracking.markers.rendering import Sensor
 from body_tracking.markers.rendering import render as render_balls
 from body_tracking.mesh.depth import DepthCamera
@@ -91,12 +92,6 @@ def looking(sensor: str, place: FloatArray, at: FloatArray) -> SensorPose:
     return SensorPose(sensor, place, so3.matrix_to_quat(np.column_stack([right, np.cross(ahead, right), ahead])))
 
 
-def _smooth(share: FloatArray) -> FloatArray:
-    """Smooth step from 0 to 1 with zero speed and acceleration at both ends."""
-    s = np.clip(share, 0.0, 1.0)
-    return np.asarray(s**3 * (10.0 - 15.0 * s + 6.0 * s**2))
-
-
 @dataclass(frozen=True, eq=False)
 class ArmScene:
     """An arm of three degrees of freedom on a linear stage, after figures 4.1-4.3 of Schlagenhauf 2017.
@@ -141,7 +136,7 @@ class ArmScene:
         """(n, 3, 3) metres in the robot's frame: shoulder, elbow and end effector at (n,) s."""
         share = (times - _REST) / _LINE
         line = np.clip(share.astype(int), 0, len(_WAYPOINTS) - 2)
-        part = _smooth(share - line)[:, None]
+        part = minimum_jerk(share - line)[:, None]
         stage, *angles = ((1.0 - part) * _WAYPOINTS[line] + part * _WAYPOINTS[line + 1]).T
         found = np.zeros((len(times), 3, 3))
         found[:, 0] = np.column_stack([stage, np.zeros_like(stage), np.full_like(stage, _SHOULDER)])

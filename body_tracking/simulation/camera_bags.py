@@ -7,7 +7,7 @@ image_transport.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -19,7 +19,7 @@ from body_tracking.camera.topics import COMPRESSED, DRIVERS, RIG_SENSOR
 from body_tracking.core import so3
 from body_tracking.core.camera import Camera
 from body_tracking.core.message_types import COMPRESSED_IMAGE, IMAGE
-from body_tracking.core.qos import LATCHED
+from body_tracking.core.qos import LATCHED, Qos
 from body_tracking.core.sensor_poses import SensorPose, level_pose
 from body_tracking.core.sources import optical_frame
 from body_tracking.markers import setup
@@ -31,11 +31,12 @@ from body_tracking.messages.calibration import pose_to_transform
 from body_tracking.messages.cameras import CAMERA_INFO
 from body_tracking.pipeline import graph
 from body_tracking.recording.progress import Progress
-from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, BagWriter, serialize
+from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, serialize
 from body_tracking.simulation.colour_images import CAMERA, Painter, colour_camera
-from body_tracking.simulation.depth_bags import TRUTH, capture_times, truth_messages
-from body_tracking.simulation.depth_scene import RATE, DepthFrame, DepthScene, held_out
+from body_tracking.simulation.depth_bags import TRUTH, capture_times, truth_of
+from body_tracking.simulation.depth_scene import RATE, DepthScene, held_out
 from body_tracking.simulation.makehuman import makehuman_for
+from body_tracking.simulation.messages import Message, print_bag, write_bag
 from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS, WORLD
 
 SHIPPED: Final = "camera_reaching"
@@ -50,14 +51,12 @@ _AWAY, _HEIGHT, _PITCH = 2.6, 1.2, 0.05
 """Distance of these cameras from the person and height above the floor, metres; pitch downwards, radians."""
 _PERSON: Final = 2.2
 """Distance of the person from the origin of ``world``, metres."""
-_EVERY: Final = 2
+EVERY: Final = 2
 """Every second image of 30 per second is used."""
 _WIDTH: Final = 480
 """Width of a colour image, pixels; a depth image has half of it."""
 _PAIR_FROM: Final = 2.0
 """Initial part of the motion that is skipped, because the person stands still, seconds."""
-_CHUNK_BYTES: Final = 32 << 20
-"""As in :mod:`body_tracking.simulation.depth_bags`."""
 
 
 def make_shipped(bags: Path, rig_folder: Path) -> None:
@@ -76,8 +75,7 @@ def make_shipped(bags: Path, rig_folder: Path) -> None:
     save_rig(rig_of(poses, colour_camera(_WIDTH)), rig_folder / setup.RIG)
     write_pair_bag(turning, poses, bags / SHIPPED_PAIR, PAIR_SECONDS, overwrite=True)
     for name in (SHIPPED, SHIPPED_PAIR):
-        size = sum(path.stat().st_size for path in (bags / name).iterdir())
-        print(f"{bags / name}: {size / 1e6:.2f} MB")
+        print_bag(bags / name, "images")
 
 
 def pose_around(camera: str, angle: float) -> SensorPose:
@@ -110,27 +108,56 @@ def write_pair_bag(
         DRIVERS["plain"].of(pose.sensor).colour + COMPRESSED: Painter.of(scene, colour_camera(_WIDTH), pose)
         for pose in poses
     }
-    with BagWriter(folder, overwrite=overwrite, chunk_bytes=_CHUNK_BYTES, flush_interval_s=float("inf")) as bag:
-        for topic in painters:
-            bag.add_topic(topic, COMPRESSED_IMAGE, IMAGES)
-        for topic, (type_name, qos) in TRUTH.items():
-            bag.add_topic(topic, type_name, qos)
-        pose = replace(poses[0], sensor=RIG_SENSOR)
-        bag.write(graph.TRUE_CALIBRATION, serialize(pose_to_transform(pose, WORLD, BAG_MESSAGES)), RECEIVED_FROM_NS)
-        progress = Progress(0, round(seconds * RATE) // _EVERY)
-        for index, frame in enumerate(scene.frames(_PAIR_FROM, _PAIR_FROM + seconds, _EVERY)):
+
+    def messages() -> Iterator[Message]:
+        yield _true_pose(replace(poses[0], sensor=RIG_SENSOR))
+        progress = Progress(0, round(seconds * RATE) // EVERY)
+        for index, frame in enumerate(scene.frames(_PAIR_FROM, _PAIR_FROM + seconds, EVERY)):
             stamp_ns, log_ns = capture_times(frame.time - _PAIR_FROM)
             for topic, painter in painters.items():
                 taken = (stamp_ns, optical_frame(painter.pose.sensor), painter.image(frame))
-                bag.write(topic, CompressedColour().encode(taken, BAG_WIRE), log_ns)
-            _write_truth(bag, scene, frame, stamp_ns, log_ns)
+                yield log_ns, topic, CompressedColour().encode(taken, BAG_WIRE)
+            yield from truth_of(scene, frame, stamp_ns, log_ns)
             progress.at(index)
         progress.end()
 
+    topics = {**dict.fromkeys(painters, (COMPRESSED_IMAGE, IMAGES)), **TRUTH}
+    write_bag(folder, topics, messages(), overwrite=overwrite)
 
-def _write_truth(bag: BagWriter, scene: DepthScene, frame: DepthFrame, stamp_ns: int, log_ns: int) -> None:
-    for received_ns, topic, cdr in truth_messages(scene, frame, stamp_ns, log_ns):
-        bag.write(topic, cdr, received_ns)
+
+def _true_pose(pose: SensorPose) -> Message:
+    return RECEIVED_FROM_NS, graph.TRUE_CALIBRATION, serialize(pose_to_transform(pose, WORLD, BAG_MESSAGES))
+
+
+def camera_topics() -> dict[str, tuple[str, Qos]]:
+    """The topics of a colour-and-depth camera, by its driver's names."""
+    names = DRIVERS["plain"].of(CAMERA)
+    return {
+        names.colour + COMPRESSED: (COMPRESSED_IMAGE, IMAGES),
+        names.colour_info: (CAMERA_INFO, LATCHED),
+        names.depth: (IMAGE, IMAGES),
+        names.depth_info: (CAMERA_INFO, LATCHED),
+    }
+
+
+def camera_messages(scene: DepthScene, seconds: float, *, truth: bool) -> Iterator[Message]:
+    """The images of a colour-and-depth camera, with progress on stderr; ``truth``: also the ground truth."""
+    painter, names = Painter.of(scene, colour_camera(_WIDTH)), DRIVERS["plain"].of(CAMERA)
+    for topic, camera in ((names.colour_info, painter.camera), (names.depth_info, scene.camera)):
+        yield RECEIVED_FROM_NS, topic, DepthInfo().encode((START_NS, camera), BAG_WIRE)
+    if truth:
+        yield _true_pose(scene.pose)
+    progress = Progress(0, round(seconds * RATE) // EVERY)
+    for index, frame in enumerate(scene.frames(0.0, seconds, EVERY)):
+        stamp_ns, log_ns = capture_times(frame.time)
+        taken = (stamp_ns, painter.camera.frame_id, painter.image(frame))
+        yield log_ns, names.colour + COMPRESSED, CompressedColour().encode(taken, BAG_WIRE)
+        depth = (stamp_ns, scene.camera.frame_id, frame.image)
+        yield log_ns, names.depth, DepthImage().encode(depth, BAG_WIRE)
+        if truth:
+            yield from truth_of(scene, frame, stamp_ns, log_ns)
+        progress.at(index)
+    progress.end()
 
 
 def write_camera_bag(scene: DepthScene, folder: Path, seconds: float, *, overwrite: bool = False) -> None:
@@ -139,30 +166,5 @@ def write_camera_bag(scene: DepthScene, folder: Path, seconds: float, *, overwri
     Raises:
         BagError: the folder exists and ``overwrite`` is false, or it cannot be written.
     """
-    painter, names = Painter.of(scene, colour_camera(_WIDTH)), DRIVERS["plain"].of(CAMERA)
-    colour = names.colour + COMPRESSED
-    topics = {
-        colour: (COMPRESSED_IMAGE, IMAGES),
-        names.colour_info: (CAMERA_INFO, LATCHED),
-        names.depth: (IMAGE, IMAGES),
-        names.depth_info: (CAMERA_INFO, LATCHED),
-        **TRUTH,
-    }
-    with BagWriter(folder, overwrite=overwrite, chunk_bytes=_CHUNK_BYTES, flush_interval_s=float("inf")) as bag:
-        for topic, (type_name, qos) in topics.items():
-            bag.add_topic(topic, type_name, qos)
-        for topic, camera in ((names.colour_info, painter.camera), (names.depth_info, scene.camera)):
-            bag.write(topic, DepthInfo().encode((START_NS, camera), BAG_WIRE), RECEIVED_FROM_NS)
-        pose = pose_to_transform(scene.pose, WORLD, BAG_MESSAGES)
-        bag.write(graph.TRUE_CALIBRATION, serialize(pose), RECEIVED_FROM_NS)
-        progress = Progress(0, round(seconds * RATE) // _EVERY)
-        for index, frame in enumerate(scene.frames(0.0, seconds, _EVERY)):
-            stamp_ns, log_ns = capture_times(frame.time)
-            taken = (stamp_ns, painter.camera.frame_id, painter.image(frame))
-            bag.write(colour, CompressedColour().encode(taken, BAG_WIRE), log_ns)
-            bag.write(
-                names.depth, DepthImage().encode((stamp_ns, scene.camera.frame_id, frame.image), BAG_WIRE), log_ns
-            )
-            _write_truth(bag, scene, frame, stamp_ns, log_ns)
-            progress.at(index)
-        progress.end()
+    messages = camera_messages(scene, seconds, truth=True)
+    write_bag(folder, {**camera_topics(), **TRUTH}, messages, overwrite=overwrite)

@@ -7,6 +7,7 @@ and the ground truth: joints, angles, the camera's pose.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -20,20 +21,17 @@ from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skele
 from body_tracking.inertial.simulated import SimulatedImu, usual_mounting
 from body_tracking.inertial.surroundings import Surroundings
 from body_tracking.kinect.simulated_sensor import Misreading, SimulatedKinect
-from body_tracking.kinematics.positional import positional_angles
 from body_tracking.mesh.codecs import DepthImage, DepthInfo
 from body_tracking.mesh.topics import IMAGES, depth_topic, info_topic
-from body_tracking.messages.angles import angles_to_joint_state
 from body_tracking.messages.calibration import pose_to_transform
 from body_tracking.messages.cameras import CAMERA_INFO
 from body_tracking.messages.cdr import encode_skeletons
-from body_tracking.messages.imus import imu_to_message
-from body_tracking.messages.model import estimate_to_joint_state
 from body_tracking.pipeline import graph
 from body_tracking.recording.progress import Progress
-from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, BagWriter, serialize
+from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, serialize
 from body_tracking.simulation.depth_scene import RATE, SENSOR, DepthFrame, DepthScene, held_out, kinect_camera
 from body_tracking.simulation.makehuman import makehuman_for
+from body_tracking.simulation.messages import Message, imu_messages, print_bag, truth_messages, write_bag
 from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS, WORLD
 
@@ -49,11 +47,7 @@ TRUTH: Final = {
 """Type and quality of service of each topic with the truth."""
 _DELAY_NS: Final = 30_000_000
 """Time from the capture of an image to its receipt."""
-_CHUNK_BYTES: Final = 32 << 20
-"""Large chunks: consecutive images differ little, so they compress to a third of the size of small chunks."""
 _FOREARMS: Final = ("forearm_left", "forearm_right")
-
-_Message = tuple[int, str, bytes]
 
 
 def shipped_scene() -> DepthScene:
@@ -73,8 +67,7 @@ def make_shipped(bags: Path) -> None:
         BagError: the recording cannot be written.
     """
     write_depth_bag(shipped_scene(), bags / SHIPPED, SECONDS, overwrite=True)
-    size = sum(path.stat().st_size for path in (bags / SHIPPED).iterdir())
-    print(f"{bags / SHIPPED}: {SECONDS:.0f} s of depth images, {size / 1e6:.2f} MB")
+    print_bag(bags / SHIPPED, f"{SECONDS:.0f} s of depth images")
 
 
 def write_depth_bag(scene: DepthScene, folder: Path, seconds: float, *, overwrite: bool = False) -> None:
@@ -90,26 +83,24 @@ def write_depth_bag(scene: DepthScene, folder: Path, seconds: float, *, overwrit
         **{f"/{segment}/imu/data": (IMU, SENSOR_DATA) for segment in _FOREARMS},
         **TRUTH,
     }
-    with BagWriter(folder, overwrite=overwrite, chunk_bytes=_CHUNK_BYTES, flush_interval_s=float("inf")) as bag:
-        for topic, (type_name, qos) in topics.items():
-            bag.add_topic(topic, type_name, qos)
-        info = DepthInfo().encode((START_NS, scene.camera), BAG_WIRE)
-        bag.write(info_topic(SENSOR), info, RECEIVED_FROM_NS)
-        pose = pose_to_transform(scene.pose, WORLD, BAG_MESSAGES)
-        bag.write(graph.TRUE_CALIBRATION, serialize(pose), RECEIVED_FROM_NS)
-        messages, progress = [*inertial_messages(scene, seconds)], Progress(0, round(seconds * RATE))
-        joints = []
-        for index, frame in enumerate(scene.frames(0.0, seconds)):
-            stamp_ns, log_ns = capture_times(frame.time)
-            image = DepthImage().encode((stamp_ns, scene.camera.frame_id, frame.image), BAG_WIRE)
-            messages.append((log_ns, depth_topic(SENSOR), image))
-            joints.append(scene.pose.apply(frame.joints))
-            messages += truth_messages(scene, frame, stamp_ns, log_ns)
-            progress.at(index)
-        messages += _skeletons(scene, np.array(joints))
-        for log_ns, topic, cdr in sorted(messages, key=lambda item: item[:2]):
-            bag.write(topic, cdr, log_ns)
-        progress.end()
+    pose = serialize(pose_to_transform(scene.pose, WORLD, BAG_MESSAGES))
+    messages = [
+        (RECEIVED_FROM_NS, info_topic(SENSOR), DepthInfo().encode((START_NS, scene.camera), BAG_WIRE)),
+        (RECEIVED_FROM_NS, graph.TRUE_CALIBRATION, pose),
+        *inertial_messages(scene, seconds),
+    ]
+    progress = Progress(0, round(seconds * RATE))
+    joints = []
+    for index, frame in enumerate(scene.frames(0.0, seconds)):
+        stamp_ns, log_ns = capture_times(frame.time)
+        image = DepthImage().encode((stamp_ns, scene.camera.frame_id, frame.image), BAG_WIRE)
+        messages.append((log_ns, depth_topic(SENSOR), image))
+        joints.append(scene.pose.apply(frame.joints))
+        messages += truth_of(scene, frame, stamp_ns, log_ns)
+        progress.at(index)
+    progress.end()
+    messages += _skeletons(scene, np.array(joints))
+    write_bag(folder, topics, sorted(messages, key=lambda item: item[:2]), overwrite=overwrite)
 
 
 def capture_times(seconds: float, delay_ns: int = _DELAY_NS) -> tuple[int, int]:
@@ -118,20 +109,17 @@ def capture_times(seconds: float, delay_ns: int = _DELAY_NS) -> tuple[int, int]:
     return START_NS + elapsed_ns, RECEIVED_FROM_NS + elapsed_ns + delay_ns
 
 
-def truth_messages(scene: DepthScene, frame: DepthFrame, stamp_ns: int, log_ns: int) -> Iterator[_Message]:
-    """Log time, topic and message of the true joints in ``world``, of the model's state and of positional angles."""
+def truth_of(scene: DepthScene, frame: DepthFrame, stamp_ns: int, log_ns: int) -> Iterator[Message]:
+    """The true joints in ``world``, the model's state and the positional angles of a frame."""
     joints = scene.pose.apply(frame.joints)
     truth = Skeleton(stamp_ns, WORLD, joints, np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8))
-    yield log_ns, graph.TRUE_SKELETON, encode_skeletons([truth])
     q, lengths = scene.course(np.array([frame.time])).q[0], scene.who.person.lengths
     exact, unknown = np.zeros((2 * MODEL.nv, 2 * MODEL.nv)), np.full(MODEL.nv, np.nan)
     state = ModelEstimate(stamp_ns, WORLD, 0, q, unknown, exact, lengths, np.zeros_like(lengths))
-    yield log_ns, graph.TRUE_MODEL_STATE, serialize(estimate_to_joint_state(state, MODEL, BAG_MESSAGES))
-    angles = angles_to_joint_state(positional_angles(truth), graph.DEFAULT_BODY, WORLD, BAG_MESSAGES)
-    yield log_ns, graph.TRUE_ANGLES, serialize(angles)
+    return truth_messages([truth], state, log_ns)
 
 
-def _skeletons(scene: DepthScene, joints: FloatArray) -> Iterator[_Message]:
+def _skeletons(scene: DepthScene, joints: FloatArray) -> Iterator[Message]:
     """Simulated skeletons of a Kinect v2 from (n, 25, 3) true joints in ``world``, stamped as the depth images."""
     kinect = SimulatedKinect(scene.pose, ClockModel(anchor_ns=START_NS))
     rng, times = np.random.default_rng([scene.seed, 3]), np.arange(len(joints)) / RATE
@@ -147,8 +135,8 @@ def _skeletons(scene: DepthScene, joints: FloatArray) -> Iterator[_Message]:
 
 def inertial_messages(
     scene: DepthScene, seconds: float, segments: Sequence[str] = _FOREARMS, rate: float = 100.0
-) -> Iterator[tuple[int, str, bytes]]:
-    """Log time, topic and message of the readings of worn sensors with their own orientation filters, unordered."""
+) -> Iterator[Message]:
+    """The readings of worn sensors with their own orientation filters, unordered."""
     for number, segment in enumerate(segments):
         place = MODEL.segment_names.index(segment)
 
@@ -161,21 +149,4 @@ def inertial_messages(
         samples = imu.samples(
             motion, seconds, START_NS, rng, surroundings=Surroundings(), received_from_ns=RECEIVED_FROM_NS
         )
-        assert samples.orientation is not None and samples.orientation_covariance is not None
-        for k, (stamp_ns, log_ns) in enumerate(
-            zip(samples.stamps_ns.tolist(), samples.received_ns.tolist(), strict=True)
-        ):
-            message = imu_to_message(
-                stamp_ns,
-                f"{segment}_link",
-                samples.angular_velocity[k],
-                samples.linear_acceleration[k],
-                samples.orientation[k],
-                (
-                    samples.orientation_covariance[k],
-                    samples.angular_velocity_covariance,
-                    samples.linear_acceleration_covariance,
-                ),
-                BAG_MESSAGES,
-            )
-            yield log_ns, f"/{segment}/imu/data", serialize(message)
+        yield from imu_messages(imu, replace(samples, magnetic_field=None))

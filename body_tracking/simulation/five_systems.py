@@ -16,10 +16,8 @@ from typing import Final, TypeVar
 
 import numpy as np
 
-from body_tracking.camera.codecs import CompressedColour
-from body_tracking.camera.topics import COMPRESSED, DRIVERS
 from body_tracking.core.clocks import ClockModel
-from body_tracking.core.message_types import COMPRESSED_IMAGE, IMAGE, IMU, POINT_CLOUD
+from body_tracking.core.message_types import IMAGE, IMU, POINT_CLOUD
 from body_tracking.core.qos import LATCHED, SENSOR_DATA, Qos
 from body_tracking.kinect.simulated_sensor import Misreading, SimulatedKinect
 from body_tracking.markers import setup
@@ -34,14 +32,15 @@ from body_tracking.messages.cameras import CAMERA_INFO
 from body_tracking.messages.cdr import encode_skeletons
 from body_tracking.pipeline import graph
 from body_tracking.recording.progress import Progress
-from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, BagWriter, serialize
+from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, serialize
 from body_tracking.simulation import marker_bags
-from body_tracking.simulation.camera_bags import pose_around
-from body_tracking.simulation.colour_images import CAMERA, Painter, colour_camera
-from body_tracking.simulation.depth_bags import TRUTH, capture_times, inertial_messages, truth_messages
+from body_tracking.simulation.camera_bags import EVERY, camera_messages, camera_topics, pose_around
+from body_tracking.simulation.colour_images import colour_camera
+from body_tracking.simulation.depth_bags import TRUTH, capture_times, inertial_messages, truth_of
 from body_tracking.simulation.depth_scene import RATE, SENSOR, DepthScene, held_out, kinect_camera
 from body_tracking.simulation.makehuman import makehuman_for
 from body_tracking.simulation.marker_scene import JOINTS, MarkerScene, scene_of
+from body_tracking.simulation.messages import Message, print_bag, write_bag
 from body_tracking.simulation.repertoire import make_movement
 from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS, WORLD, draw_clock
 
@@ -54,16 +53,11 @@ WORN: Final = ("pelvis", "upper_trunk", "upper_arm_left", "upper_arm_right", "fo
 _SEED: Final = 7
 _AROUND: Final = 0.8
 """Azimuth of the second Kinect around the person, radians."""
-_EVERY: Final = 2
-"""Every second image of 30 per second is used."""
 _WIDTH: Final = 480
 _IMU_RATE: Final = 60.0
 _BALLS_DELAY_NS: Final = 15_000_000
-_CHUNK_BYTES: Final = 32 << 20
 
 _Joint = TypeVar("_Joint", Joint, JointDescription)
-_Message = tuple[int, str, bytes]
-"""Log time, topic, serialised message."""
 
 
 def make_shipped(bags: Path, config: Path) -> None:
@@ -81,32 +75,22 @@ def make_shipped(bags: Path, config: Path) -> None:
     _make_setup(scene, config / SHIPPED)
     messages = [
         *_depth_and_truth(scene),
-        *_colour(colour),
+        *camera_messages(colour, SECONDS, truth=False),
         *_kinects(scene),
         *inertial_messages(scene, SECONDS, WORN, _IMU_RATE),
         *_balls(markers),
     ]
-    names = DRIVERS["plain"].of(CAMERA)
     topics: dict[str, tuple[str, Qos]] = {
         depth_topic(SENSOR): (IMAGE, IMAGES),
         info_topic(SENSOR): (CAMERA_INFO, LATCHED),
-        names.colour + COMPRESSED: (COMPRESSED_IMAGE, IMAGES),
-        names.colour_info: (CAMERA_INFO, LATCHED),
-        names.depth: (IMAGE, IMAGES),
-        names.depth_info: (CAMERA_INFO, LATCHED),
+        **camera_topics(),
         **{graph.skeleton_topic(sensor): (POINT_CLOUD, SENSOR_DATA) for sensor in (SENSOR, SECOND)},
         **{f"/{segment}/imu/data": (IMU, SENSOR_DATA) for segment in WORN},
         **{setup.balls_topic(camera.frame_id): (POINT_CLOUD, SENSOR_DATA) for camera in markers.rig.cameras},
         **TRUTH,
     }
-    folder = bags / SHIPPED
-    with BagWriter(folder, overwrite=True, chunk_bytes=_CHUNK_BYTES, flush_interval_s=float("inf")) as bag:
-        for topic, (type_name, qos) in topics.items():
-            bag.add_topic(topic, type_name, qos)
-        for log_ns, topic, cdr in sorted(messages, key=lambda item: item[:2]):
-            bag.write(topic, cdr, log_ns)
-    size = sum(path.stat().st_size for path in folder.iterdir())
-    print(f"{folder}: {SECONDS:.0f} s of five systems, {size / 1e6:.2f} MB")
+    write_bag(bags / SHIPPED, topics, sorted(messages, key=lambda item: item[:2]), overwrite=True)
+    print_bag(bags / SHIPPED, f"{SECONDS:.0f} s of five systems")
 
 
 def _make_setup(scene: DepthScene, folder: Path) -> None:
@@ -126,37 +110,22 @@ def _on_the_left(joint: _Joint) -> _Joint:
     return replace(joint, parent=f"{joint.parent}_left", child=f"{joint.child}_left")
 
 
-def _depth_and_truth(scene: DepthScene) -> Iterator[_Message]:
+def _depth_and_truth(scene: DepthScene) -> Iterator[Message]:
     info = DepthInfo().encode((START_NS, scene.camera), BAG_WIRE)
     yield RECEIVED_FROM_NS, info_topic(SENSOR), info
     yield RECEIVED_FROM_NS, graph.TRUE_CALIBRATION, serialize(pose_to_transform(scene.pose, WORLD, BAG_MESSAGES))
     progress = Progress(0, round(SECONDS * RATE))
     for index, frame in enumerate(scene.frames(0.0, SECONDS)):
         stamp_ns, log_ns = capture_times(frame.time)
-        if index % _EVERY == 0:
+        if index % EVERY == 0:
             image = DepthImage().encode((stamp_ns, scene.camera.frame_id, frame.image), BAG_WIRE)
             yield log_ns, depth_topic(SENSOR), image
-        yield from truth_messages(scene, frame, stamp_ns, log_ns)
+        yield from truth_of(scene, frame, stamp_ns, log_ns)
         progress.at(index)
     progress.end()
 
 
-def _colour(scene: DepthScene) -> Iterator[_Message]:
-    painter, names = Painter.of(scene, colour_camera(_WIDTH)), DRIVERS["plain"].of(CAMERA)
-    for topic, camera in ((names.colour_info, painter.camera), (names.depth_info, scene.camera)):
-        yield RECEIVED_FROM_NS, topic, DepthInfo().encode((START_NS, camera), BAG_WIRE)
-    progress = Progress(0, round(SECONDS * RATE) // _EVERY)
-    for index, frame in enumerate(scene.frames(0.0, SECONDS, _EVERY)):
-        stamp_ns, log_ns = capture_times(frame.time)
-        taken = (stamp_ns, painter.camera.frame_id, painter.image(frame))
-        yield log_ns, names.colour + COMPRESSED, CompressedColour().encode(taken, BAG_WIRE)
-        depth = (stamp_ns, scene.camera.frame_id, frame.image)
-        yield log_ns, names.depth, DepthImage().encode(depth, BAG_WIRE)
-        progress.at(index)
-    progress.end()
-
-
-def _kinects(scene: DepthScene) -> Iterator[_Message]:
+def _kinects(scene: DepthScene) -> Iterator[Message]:
     """Skeletons of two Kinects, each with its own clock, with common errors at the person."""
     misreading = Misreading.draw(np.random.default_rng([_SEED, 6]))
     for number, pose in enumerate((scene.pose, pose_around(SECOND, _AROUND))):
@@ -172,7 +141,7 @@ def _kinects(scene: DepthScene) -> Iterator[_Message]:
             yield frame.received_ns, graph.skeleton_topic(pose.sensor), encode_skeletons(frame.skeletons)
 
 
-def _balls(scene: MarkerScene) -> Iterator[_Message]:
+def _balls(scene: MarkerScene) -> Iterator[Message]:
     """Detected balls in rendered infrared images."""
     progress = Progress(0, len(scene.times))
     for index, time in enumerate(scene.times.tolist()):

@@ -36,6 +36,7 @@ from body_tracking.recording.marker_commands import fit_recording
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, BagWriter, check_new_bag
 from body_tracking.simulation.marker_scene import DIAMETER, JOINTS, MarkerScene, marker_scene, stereo_rig
+from body_tracking.simulation.messages import print_bag
 from body_tracking.simulation.repertoire import MOTIONS
 
 START_NS = 1_750_000_000 * NANOSECONDS
@@ -226,8 +227,7 @@ def make_shipped(bags: Path, folder: Path) -> None:
     scene = shipped_scene()
     write_scene(scene, bags / SHIPPED, DARK, SEED, overwrite=True)
     make_setup(marker_scene(_MOTION, SEED, FIT_RATE, FIT_SECONDS, 0.0), folder, SEED)
-    size = sum(path.stat().st_size for path in (bags / SHIPPED).iterdir())
-    print(f"{bags / SHIPPED}: {len(scene.times)} pairs of images, {size / 1e6:.2f} MB; setup in {folder}")
+    print_bag(bags / SHIPPED, f"{len(scene.times)} pairs of images, setup in {folder}")
 
 
 def make_setup(scene: MarkerScene, folder: Path, seed: int, joints: Sequence[JointDescription] = JOINTS) -> None:
