@@ -38,7 +38,8 @@ from real_pairs import reversals, skeletons
 
 from body_tracking.core.measurement import left_right_axes
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint
-from body_tracking.evaluation.metrics import Curve, wrapped
+from body_tracking.core.so3 import wrapped
+from body_tracking.evaluation.metrics import Curve
 from body_tracking.evaluation.reading import AngleSeries, nearest, read
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.fusion import sides

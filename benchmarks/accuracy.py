@@ -36,8 +36,9 @@ from thesis_pipeline import EKF, LKF1, LKF2, run_thesis
 
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, Skeleton, TrackingState
+from body_tracking.core.so3 import wrapped
 from body_tracking.core.sources import RecordedFrame
-from body_tracking.evaluation.metrics import Curve, Trajectory, find_delay, joint_errors, wrapped
+from body_tracking.evaluation.metrics import Curve, Trajectory, find_delay, joint_errors
 from body_tracking.evaluation.segments import segment_frames
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.kinect.occlusion import Capsules, obstruction

@@ -41,8 +41,9 @@ from body_tracking.core.clocks import ClockModel
 from body_tracking.core.measurement import BONE_CORRELATION
 from body_tracking.core.message_types import JOINT_STATE
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, IntArray, Joint, Skeleton, TrackingState
+from body_tracking.core.so3 import wrapped
 from body_tracking.core.sources import RecordedFrame, optical_frame
-from body_tracking.evaluation.metrics import Curve, wrapped
+from body_tracking.evaluation.metrics import Curve
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.kinect.simulated_sensor import Misreading, SimulatedKinect
 from body_tracking.kinematics.positional import positional_angles

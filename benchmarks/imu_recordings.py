@@ -29,14 +29,8 @@ from body_tracking.core import so3
 from body_tracking.core.body_model import SEGMENTS
 from body_tracking.core.imu import ImuSample
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
-from body_tracking.inertial.alignment import (
-    Stream,
-    align_in_pose,
-    pose_covariance,
-    pose_rotations,
-    still_periods,
-    wrapped,
-)
+from body_tracking.core.so3 import wrapped
+from body_tracking.inertial.alignment import Stream, align_in_pose, pose_covariance, pose_rotations, still_periods
 from body_tracking.inertial.clock import clock_offset, turning_of_sensor
 from body_tracking.inertial.imu_csv import ImuCsvRecording
 from body_tracking.inertial.mvnx import MvnxFrame, MvnxRecording

@@ -35,10 +35,10 @@ from worn_targets import ARM, wear_targets, write_targets
 from body_tracking.core import so3
 from body_tracking.core.orientation import SEGMENT_NUMBER
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
+from body_tracking.core.so3 import wrapped
 from body_tracking.evaluation.estimated_segments import joint_chains, read_segments, split_near
 from body_tracking.evaluation.hand_eye import HandEyeError, Mounting, Track, fit_hand_eye
 from body_tracking.evaluation.marker_reference import read_marker_reference
-from body_tracking.evaluation.metrics import wrapped
 from body_tracking.evaluation.reading import EvaluationError, read_truth
 from body_tracking.evaluation.reference_comparison import ReferenceEvaluation, evaluate_by_markers
 from body_tracking.inertial.clock import clock_offset, turning

@@ -22,7 +22,7 @@ from mesh_runs import fit_from_truth, is_absent, scene_of
 
 from body_tracking.core.joint_angles import JointAngles
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Skeleton, TrackingState
-from body_tracking.evaluation.metrics import wrapped
+from body_tracking.core.so3 import wrapped
 from body_tracking.evaluation.reading import read, true_at
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.kinematics.positional import positional_angles

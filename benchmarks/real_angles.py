@@ -25,7 +25,7 @@ from real_pairs import NOMINAL, PEOPLE
 from body_tracking.calibration.online import CalibrationParameters
 from body_tracking.core.clocks import ClockModel
 from body_tracking.core.skeleton import FloatArray
-from body_tracking.evaluation.metrics import wrapped
+from body_tracking.core.so3 import wrapped
 from body_tracking.evaluation.reading import AngleSeries, nearest, read
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.pipeline.graph import POSITIONAL

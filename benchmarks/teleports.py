@@ -34,7 +34,7 @@ from kinect_vs_vicon import kinect_skeletons
 
 from body_tracking.calibration.kinect_spine import corrected_kinect
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray
-from body_tracking.evaluation.metrics import wrapped
+from body_tracking.core.so3 import wrapped
 from body_tracking.evaluation.reading import AngleSeries, read
 from body_tracking.filters import DEFAULT_FILTER, ModelFilter, make_filter
 from body_tracking.kinematics.conventions import CONVENTIONS, angles_of, convention

@@ -34,7 +34,7 @@ from body_tracking.core.clocks import ClockModel
 from body_tracking.core.message_types import DIAGNOSTICS, JOINT_STATE, POINT_CLOUD
 from body_tracking.core.qos import SENSOR_DATA
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
-from body_tracking.evaluation.metrics import wrapped
+from body_tracking.core.so3 import wrapped
 from body_tracking.filters import DEFAULT_FILTER, FILTERS
 from body_tracking.messages.base import to_nanoseconds
 from body_tracking.messages.cdr import decode_skeletons

@@ -22,6 +22,9 @@ MIDLINE: IntArray = np.array(
 )
 """Joints that do not change when left and right are swapped."""
 
+_SWEEPS = 15
+"""Sweeps over the blocks."""
+
 OFFSET_STDDEV = 0.06
 """Prior of the constant offset of a joint between two sensors, metres (from pairs of Kinect v2 at 45 to 90 degrees)."""
 
@@ -121,7 +124,7 @@ def start_from_midline(pairs: Pairs) -> tuple[FloatArray, FloatArray] | None:
         return None
 
 
-def estimate(pairs: Pairs, rotation: FloatArray, translation: FloatArray, iterations: int = 15) -> PairEstimate:
+def estimate(pairs: Pairs, rotation: FloatArray, translation: FloatArray) -> PairEstimate:
     """Refine a pose by iteratively reweighted least squares.
 
     Minimises over R, t and the joints' offsets b
@@ -135,7 +138,6 @@ def estimate(pairs: Pairs, rotation: FloatArray, translation: FloatArray, iterat
         pairs: at least ten.
         rotation: (3, 3) start.
         translation: (3,) start, metres.
-        iterations: number of sweeps over the blocks.
 
     Raises:
         CalibrationError: too few pairs, or none in which the sensors agree on left and right.
@@ -163,7 +165,7 @@ def estimate(pairs: Pairs, rotation: FloatArray, translation: FloatArray, iterat
         if same.sum() < 5:
             raise CalibrationError("the sensors do not agree on the body's left and right in any frame")
         weights = precision / (1.0 + squared / CAUCHY**2) * same
-        if sweep == iterations:
+        if sweep == _SWEEPS:
             break
         sweep += 1
         total = weights.sum(axis=1, keepdims=True) / FRAMES_PER_SAMPLE

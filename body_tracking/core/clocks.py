@@ -135,16 +135,13 @@ def fit_clock(
 class LeastDelay:
     """The lower envelope of the delays of messages, to which transport only ever adds.
 
-    The least delay at a time is ``min_i delay_i + rise (t - t_i)`` over the messages of the window.
-
     Args:
-        window: length of the window, in the unit of the times; None for unlimited.
-        rise: growth of the least delay per unit of time, because the clocks drift.
+        window: length of the window, in the unit of the times.
     """
 
-    def __init__(self, window: int | None = None, rise: float = 0.0) -> None:
-        self._window, self._rise = window, rise
-        self._lowest: deque[tuple[int, int]] = deque()  # time, delay less the rise until then; both ascend
+    def __init__(self, window: int) -> None:
+        self._window = window
+        self._lowest: deque[tuple[int, int]] = deque()  # time and delay; both ascend
 
     def __bool__(self) -> bool:
         return bool(self._lowest)
@@ -155,17 +152,16 @@ class LeastDelay:
 
     def add(self, time: int, delay: int) -> None:
         """Add a message; times must not descend."""
-        level = delay - round(self._rise * time)
-        while self._lowest and self._lowest[-1][1] >= level:
+        while self._lowest and self._lowest[-1][1] >= delay:
             self._lowest.pop()
-        if self._window is not None or not self._lowest:
-            self._lowest.append((time, level))
-        while self._window is not None and time - self._lowest[0][0] >= self._window:
+        self._lowest.append((time, delay))
+        while time - self._lowest[0][0] >= self._window:
             self._lowest.popleft()
 
-    def at(self, time: int) -> int:
-        """The least delay at a time not before the last message, of which there must have been one."""
-        return self._lowest[0][1] + round(self._rise * time)
+    @property
+    def least(self) -> int:
+        """The least delay at the last message, of which there must have been one."""
+        return self._lowest[0][1]
 
 
 class ReceiptClock:
@@ -185,7 +181,7 @@ class ReceiptClock:
     @property
     def delay_ns(self) -> int | None:
         """The least difference of receipt and stamp; None before the first message."""
-        return self._least.at(0) if self._least else None
+        return self._least.least if self._least else None
 
     def add(self, stamp_ns: int, received_ns: int) -> bool:
         """Add a message; False when the clock was set since the last one."""

@@ -50,6 +50,12 @@ _PRODUCT[3, 3, 3] = 1.0
 _PRODUCT = _PRODUCT.reshape(16, 4)
 
 
+def wrapped(angles: FloatArray) -> FloatArray:
+    """(...) angles wrapped to [-pi, pi), radians."""
+    around: FloatArray = (angles + np.pi) % (2.0 * np.pi) - np.pi
+    return around
+
+
 def skew(v: FloatArray) -> FloatArray:
     """(..., 3, 3) the matrices of the cross product with (..., 3) vectors."""
     result: FloatArray = (v @ SKEW).reshape(*v.shape, 3)

@@ -23,6 +23,7 @@ from scipy.special import chdtri
 from body_tracking.calibration.rigid import CalibrationError, rigid_registration
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import BONES, BoolArray, FloatArray, IntArray
+from body_tracking.core.so3 import wrapped
 from body_tracking.evaluation.segments import segment_frames
 
 RATE = 100.0
@@ -424,12 +425,6 @@ def angle_errors(found: FloatArray, true: FloatArray, stddev: FloatArray | None 
         largest=_max(np.abs(error)),
         covered=covered,
     )
-
-
-def wrapped(angles: FloatArray) -> FloatArray:
-    """Angles wrapped to -pi .. pi, radians."""
-    around: FloatArray = (angles + np.pi) % (2.0 * np.pi) - np.pi
-    return around
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,9 +15,9 @@ import numpy as np
 
 from body_tracking.core.body_model import SEGMENTS
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray
+from body_tracking.core.so3 import wrapped
 from body_tracking.evaluation.estimated_segments import EstimatedSegments
 from body_tracking.evaluation.hand_eye import MAX_GAP
-from body_tracking.evaluation.metrics import wrapped
 from body_tracking.evaluation.reading import AngleSeries, EvaluationError
 from body_tracking.evaluation.reference_error import Differences, Judged, judge, notes_of
 from body_tracking.evaluation.start_clock import STAMPS_AS_THEY_ARE, start_clock

@@ -13,8 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from body_tracking.core.skeleton import BONES, JOINT_NAMES, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
+from body_tracking.core.so3 import wrapped
 from body_tracking.evaluation.comparison import MAX_GAP, AngleComparison, Evaluation
-from body_tracking.evaluation.metrics import angle_errors, wrapped
+from body_tracking.evaluation.metrics import angle_errors
 from body_tracking.evaluation.reading import AngleSeries, Tracked, nearest, true_at
 from body_tracking.evaluation.report import named_are_positional, write
 from body_tracking.kinematics.labels import limb_of

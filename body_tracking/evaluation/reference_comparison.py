@@ -19,11 +19,12 @@ from body_tracking.core.body_model import SEGMENTS
 from body_tracking.core.clocks import ClockModel
 from body_tracking.core.orientation import SEGMENT_NUMBER
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
+from body_tracking.core.so3 import wrapped
 from body_tracking.evaluation.comparison import AngleComparison
 from body_tracking.evaluation.estimated_segments import EstimatedSegments, joint_chains, split_near
 from body_tracking.evaluation.hand_eye import HandEye, HandEyeError, Mounting, fit_hand_eye
 from body_tracking.evaluation.marker_reference import MarkerReference
-from body_tracking.evaluation.metrics import angle_errors, wrapped
+from body_tracking.evaluation.metrics import angle_errors
 from body_tracking.evaluation.reading import EvaluationError, nearest
 from body_tracking.evaluation.reference_error import Differences, Judged, judge, notes_of
 from body_tracking.evaluation.start_clock import STAMPS_AS_THEY_ARE, start_clock

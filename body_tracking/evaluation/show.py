@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
-from body_tracking.evaluation.metrics import angle_errors, wrapped
+from body_tracking.core.so3 import wrapped
+from body_tracking.evaluation.metrics import angle_errors
 from body_tracking.evaluation.pictures import ENOUGH, are_fine, draw
 from body_tracking.evaluation.reading import AngleSeries, EvaluationError, read, true_at
 from body_tracking.evaluation.report import Column, Table, make_folder, write

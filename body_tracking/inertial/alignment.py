@@ -22,6 +22,7 @@ import numpy as np
 from body_tracking.core import so3
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import FloatArray, IntArray
+from body_tracking.core.so3 import wrapped
 from body_tracking.kinematics.upper_body import UpperBody
 
 Pose = Literal["t", "n"]
@@ -142,12 +143,6 @@ def yaw(angle: FloatArray | float) -> FloatArray:
     return so3.quat_to_matrix(so3.exp(np.asarray(angle, float)[..., None] * _Z))
 
 
-def wrapped(angle: FloatArray) -> FloatArray:
-    """Angles wrapped to [-pi, pi)."""
-    result: FloatArray = np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi
-    return result
-
-
 # ---------------------------------------------------------------------------------------------------------------------
 # the pose
 
@@ -204,8 +199,8 @@ def pose_covariance(
     return result
 
 
-def still_periods(streams: Sequence[Stream], least: float = STILL_TIME) -> tuple[StillPeriod, ...]:
-    """Periods in which all sensors were still for at least ``least`` seconds."""
+def still_periods(streams: Sequence[Stream]) -> tuple[StillPeriod, ...]:
+    """Periods in which all sensors were still for at least :data:`STILL_TIME`."""
     if not all(len(stream.stamps) for stream in streams):
         return ()
     begin = max(stream.stamps[0] for stream in streams)
@@ -225,7 +220,7 @@ def still_periods(streams: Sequence[Stream], least: float = STILL_TIME) -> tuple
     found = []
     for first, last in edges.reshape(-1, 2):
         start, stop = begin + _BIN * first, begin + _BIN * last
-        if stop - start >= least - 1e-9 and all(
+        if stop - start >= STILL_TIME - 1e-9 and all(
             _turned(stream.between(start, stop)) < STILL_TURN for stream in streams
         ):
             found.append(StillPeriod(float(start), float(stop)))

@@ -21,6 +21,7 @@ from vqf import VQF
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.imu import STANDARD_GRAVITY, ImuSample
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray
+from body_tracking.core.so3 import wrapped
 
 OUTAGE_S: Final = 1.0
 """A longer gap restarts the tilt, and the heading is nearly unknown afterwards."""
@@ -299,8 +300,8 @@ class OrientationEstimator:
         east, north, up = VQF.quatRotate(vqf.getQuat6D(), field)
         before = vqf.getDelta()
         vqf.updateMag(field)
-        off = _wrapped(np.arctan2(east, north) - before)
-        gain = _wrapped(vqf.getDelta() - before) / off if abs(off) > 1e-9 else 0.0
+        off = wrapped(np.arctan2(east, north) - before)
+        gain = wrapped(vqf.getDelta() - before) / off if abs(off) > 1e-9 else 0.0
         strength = float(np.sqrt(field @ field))
         self._budget.correct(
             float(np.clip(gain, 0.0, 1.0)),
@@ -396,10 +397,6 @@ def _up(quat_wxyz: FloatArray) -> FloatArray:
     """(3,) the earth's z in the sensor's frame."""
     w, x, y, z = quat_wxyz
     return np.array([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)])
-
-
-def _wrapped(angle: float) -> float:
-    return float((angle + np.pi) % (2.0 * np.pi) - np.pi)
 
 
 # --- error budget
@@ -529,7 +526,7 @@ class _Budget:
         errors = self._errors
         if known > 0.0:
             # strength and dip show two components of a disturbance; the third changes the heading
-            seen = ((strength - known) ** 2 + (known * _wrapped(dip - known_dip)) ** 2) / 2.0
+            seen = ((strength - known) ** 2 + (known * wrapped(np.array(dip - known_dip))) ** 2) / 2.0
             off = _DISTURBED_FIELD if disturbed else float(np.sqrt(seen)) / level
         else:
             off = _UNKNOWN_FIELD

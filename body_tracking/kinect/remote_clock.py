@@ -159,7 +159,7 @@ class CaptureClock:
             self._lag.clear()
         self._frames += 1
         self._lag.add(self._frames, lag)
-        target = self._lag.at(self._frames) + offset_ns - self._least_delay_ns
+        target = self._lag.least + offset_ns - self._least_delay_ns
         error = target - self._correction_ns
         if anew or abs(error) > _SET_NS:
             self._correction_ns = target

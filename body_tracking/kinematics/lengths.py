@@ -266,16 +266,14 @@ class SegmentLengths:
         frames = (*frames, (stamp_ns, points, tracked, model))
         return SegmentLengths(self.persistence, self.memory, blocks, {**self._gathered, sensor: frames})
 
-    def with_unfinished_block(
-        self, sensor: str, white: FloatArray, slow: float = 0.0, stretch: float = 0.0
-    ) -> SegmentLengths:
-        """A copy with a sensor's unfinished block as one more block; arguments as of :meth:`with_frame`."""
-        frames = self._gathered.get(sensor, ())
+    def with_unfinished_block(self, white: FloatArray) -> SegmentLengths:
+        """A copy with the unfinished block of the sensor without a name as one more; see :meth:`with_frame`."""
+        frames = self._gathered.get("", ())
         if not frames:
             return self
         # too few frames are repeated: both halves of a block need two
         frames *= -(-_MIN_FRAMES // len(frames))
-        blocks = (*self.blocks, _block(frames, white, slow, stretch))[-self.memory :]
+        blocks = (*self.blocks, _block(frames, white, 0.0, 0.0))[-self.memory :]
         return SegmentLengths(self.persistence, self.memory, blocks, self._gathered)
 
     def estimate(self) -> LengthEstimate:
@@ -355,7 +353,7 @@ class SkeletonLengths:
         if self._seen.blocks is not before:
             self._use(self._seen.estimate())
         elif not before:
-            self._use(self._seen.with_unfinished_block("", _NO_NOISE).estimate())
+            self._use(self._seen.with_unfinished_block(_NO_NOISE).estimate())
         elapsed = abs(stamp_ns - self._stamp_ns) / NANOSECONDS
         self._frames, self._stamp_ns = self._frames + 1, stamp_ns
         share = max(1.0 / self._frames, 1.0 - float(np.exp(-elapsed / _FOLLOW_TIME)))

@@ -205,7 +205,7 @@ class Ranges:
             if found[arm.elbow_q] >= 0.0 and abs(found[arm.pronation_q]) <= np.pi:
                 continue
             other = found.copy()
-            other[arm.pronation_q] = np.remainder(found[arm.pronation_q] + np.pi, 2.0 * np.pi) - np.pi
+            other[arm.pronation_q] = so3.wrapped(found[arm.pronation_q])
             candidates = [(other, False)]
             if found[arm.elbow_q] < 0.0:
                 flipped = other.copy()

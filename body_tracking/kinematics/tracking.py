@@ -190,7 +190,7 @@ class JumpDoubt:
             return angles
         seconds = (angles.stamp_ns - last.stamp_ns) / NANOSECONDS
         moved = np.nan_to_num(0.5 * seconds * (last.velocity + angles.velocity))
-        step = np.abs(np.remainder(angles.position - last.position - moved + np.pi, 2.0 * np.pi) - np.pi)
+        step = np.abs(so3.wrapped(angles.position - last.position - moved))
         jumped = step > _BAND * np.hypot(last.position_stddev, angles.position_stddev)  # never where one is NaN
         self._doubt *= math.exp(-max(seconds, 0.0) / _DOUBT_S)
         self._doubt = np.where(jumped, np.maximum(self._doubt, step / _BAND), self._doubt)
@@ -251,16 +251,14 @@ class AngleStream:
 
 
 class LengthChanges:
-    """Decides when to publish segment lengths: at first, when they change, and when they settle.
+    """Decides when to publish segment lengths: at first, when they change, and when they settle."""
 
-    Args:
-        tolerance: least difference of a length from the published one, metres.
-        period: least time between two publications, seconds.
-    """
+    TOLERANCE = 0.002
+    """Least difference of a length from the published one, metres."""
+    PERIOD_NS = NANOSECONDS
+    """Least time between two publications."""
 
-    def __init__(self, tolerance: float = 0.002, period: float = 1.0) -> None:
-        self._tolerance = tolerance
-        self._period_ns = round(period * NANOSECONDS)
+    def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
@@ -274,10 +272,10 @@ class LengthChanges:
         settled = self._before is not None and np.array_equal(self._before, lengths)
         self._before = lengths
         if self._published is not None:
-            if 0 <= stamp_ns - self._published_ns < self._period_ns:
+            if 0 <= stamp_ns - self._published_ns < self.PERIOD_NS:
                 return False
             change = float(np.abs(lengths - self._published).max())
-            if change <= self._tolerance and not (settled and change > 0.0):
+            if change <= self.TOLERANCE and not (settled and change > 0.0):
                 return False
         self._published, self._published_ns = lengths, stamp_ns
         return True

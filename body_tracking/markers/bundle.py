@@ -274,14 +274,13 @@ def adjust(rig: Rig, rotations: FloatArray, translations: FloatArray, corners: C
     )
 
 
-def free_parameters(rig: Rig, coefficients: tuple[int, ...] | None, poses: bool = True) -> BoolArray:
+def free_parameters(rig: Rig, coefficients: tuple[int, ...] | None) -> BoolArray:
     """(p,) which parameters of a rig an adjustment fits.
 
     Args:
         rig: the rig; the pose of its first camera defines the rig's frame and stays fixed.
         coefficients: free distortion coefficients, beside the camera's matrix: (0, 1) for the radial ones of Gaschler's
             eq. 4.7; None for fixed lenses.
-        poses: whether the poses of the other cameras are free.
     """
     free = np.zeros(rig.size, dtype=np.bool_)
     for index, start in enumerate(projection.offsets(rig)[:-1]):
@@ -289,6 +288,6 @@ def free_parameters(rig: Rig, coefficients: tuple[int, ...] | None, poses: bool 
         if coefficients is not None:
             free[start : start + LENS] = True
             free[start + LENS + np.array(coefficients, dtype=np.intp)] = True
-        if poses and index > 0:
+        if index > 0:
             free[start + LENS + len(camera.distortion) : start + projection.size(camera)] = True
     return free

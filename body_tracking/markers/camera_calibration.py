@@ -25,8 +25,6 @@ from body_tracking.markers.rig import Rig
 
 RADIAL: Final = (0, 1)
 """Coefficients k1 and k2 of the distortion, Gaschler's eq. 4.7."""
-PLUMB_BOB: Final = (0, 1, 2, 3, 4)
-"""All of ``plumb_bob``: k1, k2, p1, p2, k3."""
 
 MIN_CORNERS: Final = 6
 """Least number of a board's corners in an image: four determine its pose, without redundancy to check it."""
@@ -167,16 +165,12 @@ def calibrate_cameras(
     return _set_of_cameras(cameras, seen, corners, coefficients, rejected)
 
 
-def calibrate_poses(
-    cameras: Sequence[Camera], corners: Corners, coefficients: tuple[int, ...] | None = None
-) -> CameraCalibration:
+def calibrate_poses(cameras: Sequence[Camera], corners: Corners) -> CameraCalibration:
     """Calibrate the relative poses of cameras with known lenses.
 
     Args:
         cameras: two or more; the first one's frame is the rig's.
         corners: of a flat board (z = 0), seen at instants common to the cameras.
-        coefficients: distortion coefficients to refine, with the cameras' matrices, from the known values; None keeps
-            the lenses fixed.
 
     Raises:
         CalibrationError: a camera sees too few good boards or shares none with the others, or a pixel is not finite.
@@ -190,7 +184,7 @@ def calibrate_poses(
         errors = np.array([_rms(_missed(camera, each, each, corners)) for each in seen[-1].values()])
         kept = _without(boards, _too_large(errors, _SINGLE), camera.frame_id, errors, _NO_FIT, rejected)
         seen[-1] = {view: board for view, board in seen[-1].items() if view in kept}
-    return _set_of_cameras(list(cameras), seen, corners, coefficients, rejected)
+    return _set_of_cameras(list(cameras), seen, corners, None, rejected)
 
 
 def _check(corners: Corners, cameras: int) -> None:

@@ -23,7 +23,7 @@ class TargetsAlikeError(BodyTrackingError):
     """Raised when two targets, or a target and a rotated copy of itself, cannot be distinguished."""
 
 
-def check_distinct(targets: Sequence[Target], noise: float, hidden: int = 1) -> None:
+def check_distinct(targets: Sequence[Target], noise: float) -> None:
     """Reject targets that recognition would confuse.
 
     Two targets are too alike when balls of one coincide, after the best rigid alignment, with balls of the other within
@@ -34,7 +34,6 @@ def check_distinct(targets: Sequence[Target], noise: float, hidden: int = 1) -> 
     Args:
         targets: all that are used together.
         noise: standard deviation of a measured point in its worst direction, the line of sight, metres.
-        hidden: number of balls that may be hidden in a target that has at least four others.
 
     Raises:
         TargetsAlikeError: the message names the pair, the balls and the distance.
@@ -45,12 +44,12 @@ def check_distinct(targets: Sequence[Target], noise: float, hidden: int = 1) -> 
         raise TargetsAlikeError(f"noise of {noise} m, expected a positive number")
     for target in targets:
         for other in targets:
-            _check(target, other, noise, max(hidden, 0))
+            _check(target, other, noise)
 
 
-def _check(target: Target, other: Target, noise: float, hidden: int) -> None:
+def _check(target: Target, other: Target, noise: float) -> None:
     count = len(target.points)
-    fewest = max(min(count, SURE), count - hidden)
+    fewest = max(min(count, SURE), count - 1)  # one ball may be hidden
     spread = [np.trace(each.covariance) / len(each.points) / 3.0 for each in (target, other)]
     deviation = float(np.sqrt(noise**2 + sum(spread)))
     limit = SEPARATION * deviation

@@ -34,6 +34,26 @@ _FELT: Final = 1e-2
 """Information of the distances about a calibration parameter, in units of its prior, below which it is not fitted."""
 _CUT: Final = 9.0
 """Largest cost of a residual, squared standard deviations."""
+_WINDOW: Final = 0.9
+"""Seconds of images examined."""
+_REACH: Final = 6.0
+"""Largest distance from an epipolar line of a possible partner at rest, pixels."""
+_MAX_DELAY: Final = 0.02
+"""Longest delay searched for, seconds; widens the reach for moving balls."""
+_PARTNERS: Final = 5
+"""Largest number of balls within reach; a ball with more is ignored."""
+_NOISE, _JITTER = 0.15, 3e-4
+"""Standard deviations of an epipolar distance, pixels, and of the cameras' capture times, seconds."""
+_MIN_SECONDS, _MIN_DISTANCES = 0.4, 60
+"""Least time span of the window, and least number of distances in it, for a report."""
+_MIN_TURN, _MIN_DELAY = 1e-3, 4e-3
+"""Smallest turn, radians, and smallest delay, seconds, that are reported."""
+_SIGNIFICANCE: Final = 7.0
+"""Least ratio of a turn or delay to its standard deviation."""
+_COMPLETE: Final = 0.7
+"""Least share of the balls on a partner's epipolar line after the correction."""
+_AHEAD: Final = 6.0
+"""Least advantage in log likelihood over another cause."""
 
 
 class Fault(Enum):
@@ -41,44 +61,6 @@ class Fault(Enum):
 
     MOVED_CAMERA = "moved camera"
     OUT_OF_STEP = "cameras out of step"
-
-
-@dataclass(frozen=True, slots=True)
-class MonitorSettings:
-    """Thresholds for reporting a fault.
-
-    Attributes:
-        window: seconds of images examined.
-        reach: largest distance from an epipolar line of a possible partner at rest, pixels.
-        max_delay: longest delay searched for, seconds; widens the reach for moving balls.
-        partners: largest number of balls within reach; a ball with more is ignored.
-        noise: standard deviation of an epipolar distance, pixels.
-        jitter: standard deviation of the cameras' capture times, seconds.
-        min_seconds: least time span of the window for a report.
-        min_distances: least number of distances in the window.
-        min_turn: smallest turn reported, radians.
-        min_delay: smallest delay reported, seconds.
-        significance: least ratio of a turn or delay to its standard deviation.
-        complete: least share of the balls on a partner's epipolar line after the correction.
-        ahead: least advantage in log likelihood over another cause.
-    """
-
-    window: float = 0.9
-    reach: float = 6.0
-    max_delay: float = 0.02
-    partners: int = 5
-    noise: float = 0.15
-    jitter: float = 3e-4
-    min_seconds: float = 0.4
-    min_distances: int = 60
-    min_turn: float = 1e-3
-    min_delay: float = 4e-3
-    significance: float = 7.0
-    complete: float = 0.7
-    ahead: float = 6.0
-
-
-_DEFAULT: Final = MonitorSettings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,9 +137,9 @@ class _Explanation:
 class RigMonitor:
     """Collects epipolar distances and diagnoses faults of the rig."""
 
-    def __init__(self, rig: Rig, settings: MonitorSettings = _DEFAULT) -> None:
+    def __init__(self, rig: Rig) -> None:
         """Monitor a rig of two or more cameras."""
-        self._rig, self._settings = rig, settings
+        self._rig = rig
         self._geometry = rig_rays(rig)
         self._window: deque[_Distances] = deque()
         self._last: dict[str, ImageBalls] = {}
@@ -215,7 +197,7 @@ class RigMonitor:
             stamp_ns, cameras, [each[known] for each in pixels], [each[known] for each in velocities]
         )
         self._window.append(made)
-        while stamp_ns - self._window[0].stamp_ns > self._settings.window * NANOSECONDS:
+        while stamp_ns - self._window[0].stamp_ns > _WINDOW * NANOSECONDS:
             self._window.popleft()
 
     def finding(self) -> Finding | None:
@@ -230,12 +212,12 @@ class RigMonitor:
 
     def search(self) -> Generator[None, None, Finding | None]:
         """:meth:`finding` as a generator: yields after steps of about 2 ms, so that images can be processed between."""
-        settings, count = self._settings, len(self._rig.cameras)
+        count = len(self._rig.cameras)
         distance = np.concatenate([np.zeros(0), *(each.distance for each in self._window)])
-        if len(distance) < settings.min_distances:
+        if len(distance) < _MIN_DISTANCES:
             return None
         passed = self._window[-1].stamp_ns - self._window[0].stamp_ns
-        if passed < settings.min_seconds * NANOSECONDS:
+        if passed < _MIN_SECONDS * NANOSECONDS:
             return None
         balls = sum(each.balls for each in self._window)
         variance = np.concatenate([each.variance for each in self._window])
@@ -243,7 +225,7 @@ class RigMonitor:
         by_turn = np.concatenate([each.by_turn for each in self._window])
         by_delay = np.concatenate([each.by_delay for each in self._window])
         by_calibration = _felt(np.concatenate([each.by_calibration for each in self._window]), variance)
-        limits = settings.reach / float(self._geometry.focal.mean()), settings.max_delay
+        limits = _REACH / float(self._geometry.focal.mean()), _MAX_DELAY
         nothing = _explain(distance, variance, share, by_calibration, np.zeros((len(distance), 0)), 1.0)
         yield
         fits: list[tuple[float, Fault, str, _Explanation]] = []
@@ -259,12 +241,12 @@ class RigMonitor:
             yield
         fits.sort(key=lambda fit: fit[0])
         cost, fault, frame, best = fits[0]
-        least = settings.min_turn if fault is Fault.MOVED_CAMERA else settings.min_delay
-        if best.on_line < settings.complete * balls or best.size < least:
+        least = _MIN_TURN if fault is Fault.MOVED_CAMERA else _MIN_DELAY
+        if best.on_line < _COMPLETE * balls or best.size < least:
             return None
-        if nothing.cost - cost < settings.significance**2 or best.significance < settings.significance:
+        if nothing.cost - cost < _SIGNIFICANCE**2 or best.significance < _SIGNIFICANCE:
             return None
-        rivals = [fit for fit in fits[1:] if fit[0] - cost < 2.0 * settings.ahead]
+        rivals = [fit for fit in fits[1:] if fit[0] - cost < 2.0 * _AHEAD]
         if any(rival[1] is not fault for rival in rivals):
             return None  # not sure yet
         amount = best.size if fault is Fault.MOVED_CAMERA else float(best.cause[0])
@@ -285,17 +267,16 @@ class RigMonitor:
         a_size = np.linalg.norm(by_a @ geometry.rotations[a, :2].T / geometry.focal[a], axis=-1)
         b_size = np.linalg.norm(by_b @ geometry.rotations[b, :2].T / geometry.focal[b], axis=-1)
         speed = np.nan_to_num(np.linalg.norm(velocities, axis=-1))
-        reach = self._settings.reach + self._settings.max_delay * np.maximum(speed[of_a, None], speed[None, of_b])
+        reach = _REACH + _MAX_DELAY * np.maximum(speed[of_a, None], speed[None, of_b])
         near: BoolArray = np.abs(volume) < reach * np.hypot(a_size[None, :], b_size[:, None])
-        most = self._settings.partners
-        near &= (near.sum(axis=0) <= most)[None, :] & (near.sum(axis=1) <= most)[:, None]
+        near &= (near.sum(axis=0) <= _PARTNERS)[None, :] & (near.sum(axis=1) <= _PARTNERS)[:, None]
         first, second = np.nonzero(near)
         return first + of_a.start, second + of_b.start
 
     def _distances(
         self, stamp_ns: int, cameras: tuple[int, int], pixels: list[FloatArray], velocities: list[FloatArray]
     ) -> _Distances:
-        geometry, settings, count = self._geometry, self._settings, len(self._rig.cameras)
+        geometry, count = self._geometry, len(self._rig.cameras)
         n = len(pixels[0])
         if n and pixels[0].shape != pixels[1].shape:
             raise TriangulationError(f"{pixels[0].shape} and {pixels[1].shape} corresponding pixels")
@@ -337,11 +318,11 @@ class RigMonitor:
         good = np.isfinite(volume * scale)
         # a ball at rest adds no information: its centroid's bias and wrong partners stay
         speed = np.minimum(*(np.linalg.norm(each, axis=-1) for each in velocities))
-        repeats = 1.0 + _RATE * np.minimum(settings.window, _PLACE / np.maximum(speed, 1e-3))
+        repeats = 1.0 + _RATE * np.minimum(_WINDOW, _PLACE / np.maximum(speed, 1e-3))
         return _Distances(
             stamp_ns,
             (volume * scale)[good],
-            (settings.noise**2 + settings.jitter**2 * blur * scale**2)[good],
+            (_NOISE**2 + _JITTER**2 * blur * scale**2)[good],
             1.0 / repeats[good],
             (by_turn * scale[:, None])[good],
             (by_delay * scale[:, None])[good],

@@ -9,7 +9,7 @@ ands.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations
@@ -39,18 +39,17 @@ class DeadlineError(Exception):
 class Deadline:
     """A time limit."""
 
-    def __init__(self, seconds: float | None, clock: Callable[[], float] = time.perf_counter) -> None:
-        self._clock = clock
-        self._end = None if seconds is None else clock() + seconds
+    def __init__(self, seconds: float | None) -> None:
+        self._end = None if seconds is None else time.perf_counter() + seconds
 
     def check(self) -> None:
         """Raise :class:`DeadlineError` if the time is over."""
-        if self._end is not None and self._clock() > self._end:
+        if self._end is not None and time.perf_counter() > self._end:
             raise DeadlineError
 
     def remaining(self) -> float | None:
         """Remaining seconds, at least 0; None without a limit."""
-        return None if self._end is None else max(self._end - self._clock(), 0.0)
+        return None if self._end is None else max(self._end - time.perf_counter(), 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

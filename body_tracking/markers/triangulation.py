@@ -2,7 +2,7 @@
 
 Two cameras: the optimal correction of Hartley and Sturm (1997), then one Gauss-Newton step that weights each centroid
 by its covariance. More cameras: weighted least squares over all rays of a point. The covariance of a point is from the
-centroids' noise; :func:`sensitivity` gives the effect of the calibration error.
+centroids' noise, without the calibration's error.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 
 from body_tracking.core.compiled import compiled
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
-from body_tracking.markers import hartley_sturm, projection
+from body_tracking.markers import hartley_sturm
 from body_tracking.markers.observations import ImageBalls, Points
 from body_tracking.markers.rays import Rays, RigRays, TriangulationError, make_rays, rig_rays
 from body_tracking.markers.rig import Rig, parallel_cameras
@@ -433,39 +433,3 @@ def _errors(geometry: RigRays, rays: Rays, members: IntArray, positions: FloatAr
     missed = np.where((members >= 0)[:, :, None], rays.flat[members] - made, 0.0)
     errors: FloatArray = (missed[:, :, None] @ rays.weight[members] @ missed[..., None])[..., 0, 0].sum(axis=1)
     return errors
-
-
-def sensitivity(rig: Rig, positions: FloatArray, seen: BoolArray | None = None) -> FloatArray:
-    """Derivative of triangulated points by the calibration's parameters at fixed pixels.
-
-    By the implicit function theorem for the least squares problem at zero residuals: with J the derivative of the
-    pixels by the point and D that by the parameters, it is ``-inv(J' J) J' D``. The calibration's part of the joint
-    covariance of all points is ``S @ rig.covariance @ S.T`` with S of shape (3 n, p).
-
-    Args:
-        rig: the cameras.
-        positions: (n, 3) in the rig's frame, metres, in front of the cameras that see them.
-        seen: (n, c) which cameras see which point, ``points.balls >= 0``; None for all.
-
-    Returns:
-        (n, 3, p) metres per unit of each parameter of :class:`Rig`.
-
-    Raises:
-        TriangulationError: other shapes, a point seen by fewer than two cameras or not in front of them.
-    """
-    count = len(rig.cameras)
-    seen = np.ones((len(positions), count), dtype=np.bool_) if seen is None else seen
-    if positions.shape != (len(positions), 3) or seen.shape != (len(positions), count):
-        raise TriangulationError(f"positions {positions.shape}, seen {seen.shape}; expected (n, 3), (n, {count})")
-    starts = projection.offsets(rig)
-    information, pulls = np.zeros((len(positions), 3, 3)), np.zeros((len(positions), 3, rig.size))
-    for index, camera in enumerate(rig.cameras):
-        made = projection.project(camera, rig.rotations[index], rig.translations[index], positions)
-        if not np.isfinite(made.pixels[seen[:, index]]).all():
-            raise TriangulationError(f"a point behind camera {camera.frame_id}, which is to see it, or not finite")
-        turned = np.where(seen[:, index, None, None], made.by_point, 0.0).transpose(0, 2, 1)
-        information += turned @ np.where(np.isfinite(made.by_point), made.by_point, 0.0)
-        pulls[:, :, starts[index] : starts[index + 1]] = turned @ np.nan_to_num(made.by_parameters)
-    if (seen.sum(axis=1) < 2).any():
-        raise TriangulationError("a point that fewer than two cameras see has no position")
-    return -np.asarray(np.linalg.solve(information, pulls), dtype=np.float64)

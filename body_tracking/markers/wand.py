@@ -32,6 +32,8 @@ _OUTLIER: Final = (5.0, 0.5)
 """A sighting is an outlier if its residual exceeds the first number times the median and the second number of
 pixels."""
 _ROUNDS: Final = 4
+_FIRST_NOISE: Final = 0.1
+"""First guess of the standard deviation of a ball's coordinate in an image, pixels."""
 _NOISE_GUESSED: Final = (0.7, 1.4)
 """Ratio of estimated to expected noise within which the adjustment is not repeated with the estimate."""
 _RANSAC: Final = (0.9999, 2.0)
@@ -143,7 +145,6 @@ def calibrate_wand(
     seen: Sightings,
     wand: Wand,
     covariance: FloatArray | None = None,
-    noise: float = 0.1,
 ) -> WandCalibration:
     """Calibrate the relative poses of cameras.
 
@@ -154,7 +155,6 @@ def calibrate_wand(
         covariance: (p, p) of the cameras' parameters as in :class:`Rig`, of which those of the lenses are used; None
             for lenses without error. With lenses that are 1 px off and held fixed, the poses' errors are ten times the
             stated deviations.
-        noise: first guess of the standard deviation of a ball's coordinate in an image, pixels.
 
     Raises:
         BundleError: the sightings do not determine the poses.
@@ -170,6 +170,7 @@ def calibrate_wand(
     used: BoolArray = np.asarray(np.isfinite(flat).all(axis=-1))
     errors = _pixels(rig, seen, intersect(rig, seen.where(used), len(wand.places), flat[used])) - seen.pixels
     used &= _inliers(np.linalg.norm(errors, axis=-1), used)
+    noise = _FIRST_NOISE
     for number in range(_ROUNDS):
         used = used & (_counts(seen, used) >= 2)
         points = intersect(rig, seen.where(used), len(wand.places), flat[used])

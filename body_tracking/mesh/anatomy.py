@@ -41,21 +41,21 @@ def segment_frames(
     for side in SIDES:
         for bone, end in (("hip", "knee"), ("knee", "ankle")):
             along = place[f"{side}_{end}"] - place[f"{side}_{bone}"]
-            frames[list(names).index(f"{side}_{bone}")] = _frame(-along, forward)
+            frames[list(names).index(f"{side}_{bone}")] = bone_frame(-along, forward)
         upper = place[f"{side}_elbow"] - place[f"{side}_shoulder"]
         fore = place[f"{side}_wrist"] - place[f"{side}_elbow"]
         axis = np.cross(upper, fore)
         if np.linalg.norm(axis) < np.sin(_STRAIGHT) * np.linalg.norm(upper) * np.linalg.norm(fore):
             axis = np.cross(upper, forward)
         # flexion turns about -y, and x completes the frame
-        frames[list(names).index(f"{side}_shoulder")] = _frame(-upper, np.cross(-axis, -upper))
+        frames[list(names).index(f"{side}_shoulder")] = bone_frame(-upper, np.cross(-axis, -upper))
         thumb = forward if thumbs is None else thumbs[side]
         for bone in ("elbow", "wrist"):
-            frames[list(names).index(f"{side}_{bone}")] = _frame(-fore, thumb)
+            frames[list(names).index(f"{side}_{bone}")] = bone_frame(-fore, thumb)
     return frames
 
 
-def _frame(up: FloatArray, forward: FloatArray) -> FloatArray:
+def bone_frame(up: FloatArray, forward: FloatArray) -> FloatArray:
     """(3, 3) columns x, y, z: z along ``up``, x as near ``forward`` as possible."""
     z = up / np.linalg.norm(up)
     y = np.cross(z, forward)

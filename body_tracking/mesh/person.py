@@ -19,6 +19,10 @@ from body_tracking.core.compiled import compiled
 from body_tracking.core.skeleton import BoolArray, FloatArray, SingleArray
 from body_tracking.mesh.depth import DepthCamera
 
+_TILT: Final = 0.7
+"""Largest angle between the floor's normal and the image's upward direction, radians."""
+_ON_FLOOR: Final = 0.02
+"""Largest distance of a point on the floor from its plane, metres."""
 _CLEARANCE: Final = 0.05
 """Least distance of a person from the background or above the floor, metres; 12 standard deviations at 4.8 m."""
 _REVEALED, _SMALL, _ABSORBED = 3, 30, 300
@@ -82,12 +86,11 @@ class PersonFinder:
     """Segments one person in the images of a stationary camera.
 
     Args:
-        view: the camera.
-        floor: the floor if known; else it is estimated from the first images.
+        view: the camera; the floor is estimated from its first images.
     """
 
-    def __init__(self, view: DepthCamera, floor: Floor | None = None) -> None:
-        self._view, self._given = view, floor
+    def __init__(self, view: DepthCamera) -> None:
+        self._view = view
         self.reset()
 
     def reset(self) -> None:
@@ -96,7 +99,7 @@ class PersonFinder:
         self._background: SingleArray = np.zeros(shape, np.float32)
         self._other: SingleArray = np.zeros(shape, np.float32)
         self._stays = np.zeros(shape, np.int16)
-        self.floor = self._given
+        self.floor: Floor | None = None
         self._looks = 0
 
     def find(self, depth: SingleArray, predicted: FloatArray | None = None, choice: int = 0) -> Found:
@@ -167,17 +170,15 @@ def _person_among(
     return own, alike | own, len(numbers)
 
 
-def find_floor(view: DepthCamera, depth: SingleArray, tilt: float = 0.7, tolerance: float = 0.02) -> Floor | None:
+def find_floor(view: DepthCamera, depth: SingleArray) -> Floor | None:
     """The largest upward plane with nothing below it; None if there is none.
 
     Random sample consensus (Fischler and Bolles 1981) over 200 triples of points from the lower half of the image, with
     a fixed seed; then a least-squares plane through its inliers.
 
     Args:
-        view: the camera, level within ``tilt``.
+        view: the camera, level within :data:`_TILT`.
         depth: (height, width) metres, 0 where missing.
-        tilt: largest angle between the plane's normal and the image's upward direction, radians.
-        tolerance: largest distance of an inlier, metres.
     """
     points = view.points(depth)[depth.shape[0] // 2 :: 2, ::16].reshape(-1, 3).astype(np.float64)
     points = points[np.isfinite(points).all(axis=1)]
@@ -190,15 +191,15 @@ def find_floor(view: DepthCamera, depth: SingleArray, tilt: float = 0.7, toleran
     known = lengths > 1e-4
     normals = normals[known] / lengths[known, None]
     normals *= np.where(normals[:, 1] > 0.0, -1.0, 1.0)[:, None]
-    origins = a[known][-normals[:, 1] > np.cos(tilt)]
-    normals = normals[-normals[:, 1] > np.cos(tilt)]
+    origins = a[known][-normals[:, 1] > np.cos(_TILT)]
+    normals = normals[-normals[:, 1] > np.cos(_TILT)]
     heights = points @ normals.T - (origins * normals).sum(axis=1)
-    on, below = (np.abs(heights) < tolerance).mean(axis=0), (heights < -2.0 * tolerance).mean(axis=0)
+    on, below = (np.abs(heights) < _ON_FLOOR).mean(axis=0), (heights < -2.0 * _ON_FLOOR).mean(axis=0)
     on = np.where(below < 0.02, on, 0.0)
     if not on.size or on.max() < 0.1:
         return None
     distances = heights[:, np.argmax(on)]
-    for within in (tolerance, 0.6 * tolerance):
+    for within in (_ON_FLOOR, 0.6 * _ON_FLOOR):
         # the second round is stricter, because the lowest points of walls are near the floor too
         chosen = points[np.abs(distances) < within]
         middle = chosen.mean(axis=0)

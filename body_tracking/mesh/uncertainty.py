@@ -102,12 +102,10 @@ class Placed:
     Attributes:
         points: (n, 3) metres in the camera's frame.
         covariance: (n, 3, 3) square metres.
-        pose_variances: (3 + 3 J,) of the pose's change, m^2 and rad^2.
     """
 
     points: FloatArray
     covariance: FloatArray
-    pose_variances: FloatArray
 
 
 def placed(
@@ -145,7 +143,6 @@ def placed(
     considered[components:, components:] = CLOTH**2 * np.eye(joints)
     own = np.linalg.inv(fit.information + 1e-6 * np.eye(len(fit.information)))
     gain = own @ (rows.T * fit.weights) @ others
-    pose = own + gain @ considered @ gain.T
     # Jacobians of the landmarks by the pose and by the shape
     bones = landmarks.bones
     turned = posed.turned[bones]
@@ -157,7 +154,7 @@ def placed(
     through[..., :components] += by_shape
     covariance = jacobian @ own @ jacobian.mT + through @ considered @ through.mT
     covariance += RESIDUAL_SHAPE**2 * np.eye(3)
-    return Placed(points, covariance, np.diag(pose).copy())
+    return Placed(points, covariance)
 
 
 @compiled

@@ -36,6 +36,7 @@ from body_tracking.core.clocks import jumped_back
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.joint_angles import JointAngles
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
+from body_tracking.core.so3 import wrapped
 from body_tracking.robot.calibration import CalibrationWatch
 from body_tracking.robot.limiter import Limiter
 from body_tracking.robot.mapping import TRAJECTORY, RobotMapping
@@ -358,7 +359,7 @@ class Follower:
             sound = possible & np.isfinite(stddev)
         most = np.where(self._used, mapping.max_stddev[:, None], np.inf)
         known = (~self._used | (sound & (stddev <= most))).all(axis=1)
-        turned = np.remainder(np.where(sound, predicted, 0.0) + np.pi, 2.0 * np.pi) - np.pi
+        turned = wrapped(np.where(sound, predicted, 0.0))
         target = mapping.matrix @ turned + mapping.offset
         # Of the equivalent positions, the one nearest to the joint.
         turns = np.divide(self._limiter.position - target, mapping.period, out=np.zeros(n), where=mapping.period > 0.0)

@@ -35,7 +35,7 @@ from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, serialize
 from body_tracking.simulation.colour_images import CAMERA, Painter, colour_camera
 from body_tracking.simulation.depth_bags import TRUTH, capture_times, truth_of
 from body_tracking.simulation.depth_scene import RATE, DepthScene, held_out
-from body_tracking.simulation.makehuman import makehuman_for
+from body_tracking.simulation.makehuman import needed_makehuman
 from body_tracking.simulation.messages import Message, print_bag, write_bag
 from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS, WORLD
 
@@ -67,7 +67,7 @@ def make_shipped(bags: Path, rig_folder: Path) -> None:
         BagError: a recording cannot be written.
         RigFileError: the rig cannot be written.
     """
-    people = makehuman_for(SHIPPED)
+    people = needed_makehuman()
     scene = DepthScene(held_out(people, 1), "reaching", 1, colour_camera(_WIDTH // 2), still=True)
     write_camera_bag(scene, bags / SHIPPED, SECONDS, overwrite=True)
     turning = DepthScene(held_out(people, 3), "torso_twist", 3, colour_camera(_WIDTH // 4))

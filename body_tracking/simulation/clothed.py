@@ -14,6 +14,7 @@ import numpy as np
 
 from body_tracking.core import so3
 from body_tracking.core.skeleton import N_JOINTS, FloatArray, Joint
+from body_tracking.mesh.anatomy import bone_frame
 from body_tracking.simulation.makehuman import Body
 from body_tracking.simulation.people import MODEL, Course, Person, joints
 
@@ -115,8 +116,8 @@ class ClothedPerson:
             shoulder, elbow, wrist = (body.head_of(f"{bone}.{suffix}") for _, bone in _ARM_JOINTS)
             flexion = np.cross(elbow - shoulder, wrist - elbow)
             up = (shoulder - elbow) / np.linalg.norm(shoulder - elbow)
-            rest_upper = _frame(up, np.cross(-flexion, up))
-            rest_fore = _frame(elbow - wrist, body.across[number])
+            rest_upper = bone_frame(up, np.cross(-flexion, up))
+            rest_fore = bone_frame(elbow - wrist, body.across[number])
             found[f"clavicle.{suffix}"] = clavicle
             found[f"upperarm01.{suffix}"] = upper @ _untwisted(clavicle.T @ upper) @ rest_upper.T
             found[f"upperarm02.{suffix}"] = upper @ rest_upper.T
@@ -129,9 +130,9 @@ class ClothedPerson:
                 ("HIP", "KNEE", "upperleg01", "lowerleg01"),
                 ("KNEE", "ANKLE", "lowerleg01", "foot"),
             ):
-                rest = _frame(body.head_of(f"{bone}.{suffix}") - body.head_of(f"{end}.{suffix}"), np.eye(3)[0])
-                found[f"{bone}.{suffix}"] = _frame(places[a] - places[b], ahead) @ rest.T
-            found[f"foot.{suffix}"] = _frame(np.eye(3)[2], ahead)
+                rest = bone_frame(body.head_of(f"{bone}.{suffix}") - body.head_of(f"{end}.{suffix}"), np.eye(3)[0])
+                found[f"{bone}.{suffix}"] = bone_frame(places[a] - places[b], ahead) @ rest.T
+            found[f"foot.{suffix}"] = bone_frame(np.eye(3)[2], ahead)
         rotations = np.empty((len(body.rig.names), 3, 3))
         for number, (name, parent) in enumerate(zip(body.rig.names, body.rig.parents, strict=True)):
             # fingers, toes and the face are rigid
@@ -152,14 +153,6 @@ def _kinect_joints(body: Body, heads: FloatArray, head: FloatArray) -> FloatArra
         for name, bone in (*_ARM_JOINTS, *_LEG_JOINTS, *_HAND_JOINTS):
             found[Joint[f"{name}_{side.upper()}"]] = place[f"{bone}.{suffix}"]
     return found
-
-
-def _frame(up: FloatArray, forward: FloatArray) -> FloatArray:
-    """(3, 3) columns x, y, z: z along ``up``, x as near ``forward`` as possible."""
-    z = up / np.linalg.norm(up)
-    y = np.cross(z, forward)
-    y /= np.linalg.norm(y)
-    return np.column_stack([np.cross(y, z), y, z])
 
 
 def _part(rotation: FloatArray, share: float) -> FloatArray:

@@ -30,7 +30,7 @@ from body_tracking.pipeline import graph
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, serialize
 from body_tracking.simulation.depth_scene import RATE, SENSOR, DepthFrame, DepthScene, held_out, kinect_camera
-from body_tracking.simulation.makehuman import makehuman_for
+from body_tracking.simulation.makehuman import needed_makehuman
 from body_tracking.simulation.messages import Message, imu_messages, print_bag, truth_messages, write_bag
 from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS, WORLD
@@ -56,7 +56,7 @@ def shipped_scene() -> DepthScene:
     Raises:
         MakeHumanError: MakeHuman's data are missing.
     """
-    return DepthScene(held_out(makehuman_for(SHIPPED), 4), "reaching", 4, kinect_camera(2), still=True)
+    return DepthScene(held_out(needed_makehuman(), 4), "reaching", 4, kinect_camera(2), still=True)
 
 
 def make_shipped(bags: Path) -> None:

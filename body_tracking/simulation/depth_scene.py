@@ -72,8 +72,6 @@ class DepthScene:
         seed: of the person's manner and the sensor's errors.
         camera: intrinsics.
         errors: of the depth.
-        seconds: of the motion; None for its own length.
-        standard: perform the motion without an individual manner.
         table: whether a table stands in front of the person's left side.
         speed: factor on the motion's speed.
         still: whether the errors of the room are constant over images, which makes recordings small.
@@ -84,8 +82,6 @@ class DepthScene:
     seed: int = 0
     camera: Camera = field(default_factory=kinect_camera)
     errors: DepthErrors = field(default_factory=DepthErrors)
-    seconds: float | None = None
-    standard: bool = False
     table: bool = False
     speed: float = 1.0
     still: bool = False
@@ -98,8 +94,7 @@ class DepthScene:
     @property
     def movement(self) -> Movement:
         """The person's performance of the motion."""
-        own = None if self.standard else np.random.default_rng([self.seed, self._name, 2])
-        return make_movement(self.motion, self.who.person, own, self.seconds)
+        return make_movement(self.motion, self.who.person, np.random.default_rng([self.seed, self._name, 2]))
 
     @property
     def _name(self) -> int:

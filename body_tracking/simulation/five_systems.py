@@ -38,7 +38,7 @@ from body_tracking.simulation.camera_bags import EVERY, camera_messages, camera_
 from body_tracking.simulation.colour_images import colour_camera
 from body_tracking.simulation.depth_bags import TRUTH, capture_times, inertial_messages, truth_of
 from body_tracking.simulation.depth_scene import RATE, SENSOR, DepthScene, held_out, kinect_camera
-from body_tracking.simulation.makehuman import makehuman_for
+from body_tracking.simulation.makehuman import needed_makehuman
 from body_tracking.simulation.marker_scene import JOINTS, MarkerScene, scene_of
 from body_tracking.simulation.messages import Message, print_bag, write_bag
 from body_tracking.simulation.repertoire import make_movement
@@ -67,7 +67,7 @@ def make_shipped(bags: Path, config: Path) -> None:
         MakeHumanError: MakeHuman's data are missing.
         BagError: the recording cannot be written.
     """
-    who = held_out(makehuman_for(SHIPPED), _SEED)
+    who = held_out(needed_makehuman(), _SEED)
     scene = DepthScene(who, MOTION, _SEED, kinect_camera(2), still=True)
     colour = DepthScene(who, MOTION, _SEED, colour_camera(_WIDTH // 2), still=True)
     times = np.arange(round(SECONDS * RATE)) / RATE

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import FloatArray
+from body_tracking.core.so3 import wrapped
 
 DISTANCE: Final = 2.0
 """Metres from the person to the sensors (thesis 5.2.2)."""
@@ -95,4 +96,4 @@ def around(
     for number, (offset, direction) in enumerate(zip(offsets, directions, strict=True)):
         turn = Rotation.from_euler("Z", direction + np.pi) * level
         poses.append(SensorPose(f"kinect{number + 1}", position + offset, turn.as_quat()))
-    return Layout(tuple(poses), position, float((yaw + np.pi) % (2.0 * np.pi) - np.pi))
+    return Layout(tuple(poses), position, float(wrapped(yaw)))

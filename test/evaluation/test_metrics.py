@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from body_tracking.core.skeleton import BONES, N_JOINTS, NANOSECONDS, FloatArray, Joint
+from body_tracking.core.so3 import wrapped
 from body_tracking.evaluation.metrics import (
     Curve,
     MetricsError,
@@ -28,7 +29,6 @@ from body_tracking.evaluation.metrics import (
     off_track,
     pose_errors,
     position_coverage,
-    wrapped,
 )
 from body_tracking.evaluation.reading import read_skeletons
 from body_tracking.evaluation.segments import segment_frames

@@ -35,7 +35,7 @@ from body_tracking.core.skeleton import (
     Skeleton,
     TrackingState,
 )
-from body_tracking.evaluation.metrics import wrapped
+from body_tracking.core.so3 import wrapped
 from body_tracking.filters.ekf.filter import ExtendedKalmanFilter
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.kinematics.compiled_posture import prior_rows, prior_table

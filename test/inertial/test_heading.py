@@ -11,13 +11,8 @@ from hypothesis import strategies as st
 
 from body_tracking.core import so3
 from body_tracking.core.skeleton import FloatArray, Joint
-from body_tracking.inertial.alignment import (
-    Alignment,
-    AlignmentError,
-    elbow_segment_axes,
-    wrapped,
-    yaw,
-)
+from body_tracking.core.so3 import wrapped
+from body_tracking.inertial.alignment import Alignment, AlignmentError, elbow_segment_axes, yaw
 from body_tracking.inertial.heading import HeadingTracker, bone_of
 from draws import draws
 

@@ -10,6 +10,7 @@ from scipy.stats import chi2
 
 from body_tracking.core import so3
 from body_tracking.core.skeleton import FloatArray
+from body_tracking.core.so3 import wrapped
 from body_tracking.inertial.alignment import (
     Alignment,
     AlignmentError,
@@ -19,7 +20,6 @@ from body_tracking.inertial.alignment import (
     pose_of,
     pose_rotations,
     still_periods,
-    wrapped,
     yaw,
 )
 from body_tracking.kinematics.upper_body import UpperBody

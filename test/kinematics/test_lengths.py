@@ -221,7 +221,7 @@ def test_an_unfinished_block_can_be_used_from_the_first_frame() -> None:
         seen = gathered(times[:count], points[:count])
         assert not seen.blocks
         assert not seen.estimate().seen.any()
-        estimate = seen.with_unfinished_block("", np.zeros(len(POINTS))).estimate()
+        estimate = seen.with_unfinished_block(np.zeros(len(POINTS))).estimate()
         assert estimate.seen.all()
         assert_allclose(estimate.lengths, lengths, rtol=0.0, atol=1e-6)
 
