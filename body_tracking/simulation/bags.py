@@ -118,8 +118,7 @@ def _truth(recording: SimulatedRecording) -> Iterator[Message]:
     due_ns = int(first.stamps_ns[0])
     for k, stamp_ns in enumerate(first.stamps_ns.tolist()):
         log_ns = RECEIVED_FROM_NS + stamp_ns - START_NS
-        # positions only, as from a sensor
-        skeletons = [replace(each.skeleton(k, body), velocities=None) for body, each in enumerate(recording.truths)]
+        skeletons = [truth.skeleton(k, body) for body, truth in enumerate(recording.truths)]
         yield from truth_messages(skeletons, first.estimate(k), log_ns)
         if stamp_ns >= due_ns:
             due_ns += NANOSECONDS

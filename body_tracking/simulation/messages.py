@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -63,7 +64,8 @@ def imu_messages(imu: SimulatedImu, samples: ImuSamples) -> Iterator[Message]:
 
 def truth_messages(skeletons: list[Skeleton], state: ModelEstimate, log_ns: int) -> Iterator[Message]:
     """The true joints of all people, and of the first one the state of the body model and the positional angles."""
-    yield log_ns, graph.TRUE_SKELETON, encode_skeletons(skeletons)
+    # positions only, as from a sensor
+    yield log_ns, graph.TRUE_SKELETON, encode_skeletons([replace(each, velocities=None) for each in skeletons])
     yield log_ns, graph.TRUE_MODEL_STATE, serialize(estimate_to_joint_state(state, MODEL, BAG_MESSAGES))
     angles = positional_angles(skeletons[0])
     message = angles_to_joint_state(angles, graph.DEFAULT_BODY, skeletons[0].frame_id, BAG_MESSAGES)
