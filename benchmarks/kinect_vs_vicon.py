@@ -39,7 +39,7 @@ from __future__ import annotations
 import csv
 import gzip
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
@@ -50,7 +50,7 @@ import numpy as np
 from scipy.optimize import brentq
 from time_warp import TimeWarp, compare, estimate_warp
 
-from body_tracking.calibration.arm_directions import ArmLaw, corrected_arms, fit_arm_law
+from body_tracking.calibration.arm_directions import ArmLaw, corrected_arms
 from body_tracking.calibration.kinect_spine import corrected_kinect
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.measurement import joint_stddev
@@ -385,6 +385,35 @@ def load(file: Path) -> Clip:
         skeletons,
         np.stack([sample(at, vicon.times, getattr(vicon, angle)) for angle in ANGLES], axis=1),
     )
+
+
+def fit_arm_law(clips: Sequence[tuple[str, FloatArray, FloatArray]], ridge: float = 0.1) -> ArmLaw:
+    """Fit the coefficients of the arms' directions by ridge regression of the differences (Hoerl and Kennard 1970).
+
+    ``W = D^T X (X^T X + r I)^-1`` with rows of ``X`` and ``D`` for each frame. All subjects have equal weights,
+    likewise all clips of a subject, and the weights sum to one.
+
+    Args:
+        clips: subject, and (n, 2, 3) unit directions of upper arm and forearm, measured and anatomical, of the right
+            arm in the axes of the thorax; frames with NaN are left out.
+        ridge: ``r``, in units of the mean square of a direction's component times three.
+    """
+    subjects = [subject for subject, _, _ in clips]
+    pairs = []
+    for subject, measured, anatomical in clips:
+        known = np.isfinite(measured).all(axis=(1, 2)) & np.isfinite(anatomical).all(axis=(1, 2))
+        weight = 1.0 / (len(set(subjects)) * subjects.count(subject) * max(int(known.sum()), 1))
+        pairs.append((measured[known], anatomical[known], np.full(int(known.sum()), weight)))
+    measured, anatomical, weights = (np.concatenate(each) for each in zip(*pairs, strict=True))
+    away = anatomical - measured
+
+    def regression(rows: FloatArray, differences: FloatArray) -> FloatArray:
+        weighted = (weights[:, None] * rows).T
+        square = weighted @ rows + ridge * np.eye(rows.shape[1])
+        return np.linalg.solve(square, weighted @ differences).T.astype(np.float64)
+
+    u, f, one = measured[:, 0], measured[:, 1], np.ones((len(measured), 1))
+    return ArmLaw(regression(np.hstack([one, u]), away[:, 0]), regression(np.hstack([one, u, f]), away[:, 1]))
 
 
 def law_of(clips: list[Clip]) -> ArmLaw:

@@ -29,12 +29,13 @@ from typing import Any
 
 import common
 import numpy as np
+from joint_pairs import fit_pair
 
 from body_tracking.core import so3
 from body_tracking.core.skeleton import FloatArray, IntArray
 from body_tracking.markers.joint_model import Joint, JointKind, about_z, turn_angles
 from body_tracking.markers.joint_starts import closed_form
-from body_tracking.markers.joints import JointFit, fit_ball_joint, fit_hinge_joint, relative_poses
+from body_tracking.markers.joints import JointFit, relative_poses
 from body_tracking.markers.observations import TargetPose
 from body_tracking.markers.pose_table import pose_table
 
@@ -123,7 +124,7 @@ def halves_of(thigh: list[TargetPose], shank: list[TargetPose], whole: Joint) ->
     common_bend = [part[(bend[part] >= first) & (bend[part] <= last)] for part in parts]
 
     def likely(part: IntArray) -> Joint:
-        return fit_hinge_joint([thigh[row] for row in part], [shank[row] for row in part], "knee").joint
+        return fit_pair(JointKind.HINGE, [thigh[row] for row in part], [shank[row] for row in part], "knee").joint
 
     def sara(part: IntArray) -> Joint:
         targets = thigh[0].name, shank[0].name
@@ -216,21 +217,21 @@ def main() -> int:
 
     trial = markers(knee_file)
     thigh, shank = cluster(trial, THIGH), cluster(trial, SHANK)
-    fits = {"knee": fit_hinge_joint(thigh, shank, "knee")}
+    fits = {"knee": fit_pair(JointKind.HINGE, thigh, shank, "knee")}
     halves, floor = halves_of(thigh, shank, fits["knee"].joint)
     beside = peers("knee", thigh, shank, fits["knee"])
 
     trial = markers(hip_file)
     pelvis, thigh = cluster(trial, PELVIS), cluster(trial, THIGH)
-    fits["hip"] = fit_ball_joint(pelvis, thigh, "hip")
-    fits["hip, wrong"] = fit_ball_joint(pelvis, cluster(trial, THIGH + EPICONDYLES), "hip")
+    fits["hip"] = fit_pair(JointKind.BALL, pelvis, thigh, "hip")
+    fits["hip, wrong"] = fit_pair(JointKind.BALL, pelvis, cluster(trial, THIGH + EPICONDYLES), "hip")
     beside += peers("hip", pelvis, thigh, fits["hip"])
 
     trial = markers(gait_file)
     for side in ("L", "R"):
         upper = cluster(trial, (f"{side}SHO", f"{side}UPA", f"{side}ELB"))
         lower = cluster(trial, (f"{side}FRM", f"{side}WRA", f"{side}WRB"))
-        fits[f"elbow {side}"] = fit_hinge_joint(upper, lower, "elbow")
+        fits[f"elbow {side}"] = fit_pair(JointKind.HINGE, upper, lower, "elbow")
 
     met = {
         f"knee's axis of both halves within {HALVES_BAR_DEG:g} deg {where} (floor {floor:.1f})": value <= HALVES_BAR_DEG

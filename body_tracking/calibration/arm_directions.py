@@ -6,19 +6,15 @@ axes of the thorax (forward, left, up; of a right arm, a left one mirrored), the
 
     u' ~ u + U (1, u),   f' ~ f + F (1, u, f)                                                                       (1)
 
-each normalised. ``U`` (3, 4) and ``F`` (3, 7) are the ridge regression of the differences from joint centres by Vicon,
-
-    W = D^T X (X^T X + r I)^-1                                                                                      (2)
-
-with rows of ``X`` and ``D`` for each frame (Hoerl and Kennard 1970). All subjects have equal weights, likewise all
-clips of a subject, and the weights sum to one. Eq. (1) has an exact inverse: with ``u + A u + b = s u'`` and
+each normalised. ``U`` (3, 4) and ``F`` (3, 7) are fitted to joint centres by Vicon (``benchmarks/kinect_vs_vicon.py``).
+Eq. (1) has an exact inverse: with ``u + A u + b = s u'`` and
 ``|u| = 1``, ``u = s p - q``, ``p = (I + A)^-1 u'``, ``q = (I + A)^-1 b``, and ``s`` is the greater root of
 ``|s p - q|^2 = 1``. The simulated Kinect errs by this inverse.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -27,8 +23,6 @@ import numpy as np
 from body_tracking.calibration.joint_centres import body_axes
 from body_tracking.core.skeleton import FloatArray, IntArray, Joint, Skeleton
 
-RIDGE: Final = 0.1
-"""``r`` of eq. (2), in units of the mean square of a direction's component times three."""
 _J = Joint
 _ARMS: Final[IntArray] = np.array(
     [[_J.SHOULDER_LEFT, _J.ELBOW_LEFT, _J.WRIST_LEFT], [_J.SHOULDER_RIGHT, _J.ELBOW_RIGHT, _J.WRIST_RIGHT]],
@@ -96,37 +90,6 @@ def corrected_arms(skeleton: Skeleton, law: ArmLaw = KINECT_V2) -> Skeleton:
     known = np.where(skeleton.valid[:, None], skeleton.positions, np.nan)
     turned = turn_arms(known, body_axes(known), law.anatomical)
     return replace(skeleton, positions=np.where(skeleton.valid[:, None], turned, skeleton.positions))
-
-
-def fit_arm_law(clips: Sequence[tuple[str, FloatArray, FloatArray]], ridge: float = RIDGE) -> ArmLaw:
-    """Fit the coefficients by the ridge regression of eq. (2).
-
-    Args:
-        clips: subject, and (n, 2, 3) unit directions of upper arm and forearm, measured and anatomical, of the right
-            arm in the axes of the thorax; frames with NaN are left out.
-        ridge: ``r``.
-
-    Raises:
-        ValueError: no frames.
-    """
-    subjects = [subject for subject, _, _ in clips]
-    pairs = []
-    for subject, measured, anatomical in clips:
-        known = np.isfinite(measured).all(axis=(1, 2)) & np.isfinite(anatomical).all(axis=(1, 2))
-        weight = 1.0 / (len(set(subjects)) * subjects.count(subject) * max(int(known.sum()), 1))
-        pairs.append((measured[known], anatomical[known], np.full(int(known.sum()), weight)))
-    if not sum(len(weights) for _, _, weights in pairs):
-        raise ValueError("arm directions: no frame in which both directions are known")
-    measured, anatomical, weights = (np.concatenate(each) for each in zip(*pairs, strict=True))
-    away = anatomical - measured
-
-    def regression(rows: FloatArray, differences: FloatArray) -> FloatArray:
-        weighted = (weights[:, None] * rows).T
-        square = weighted @ rows + ridge * np.eye(rows.shape[1])
-        return np.linalg.solve(square, weighted @ differences).T.astype(np.float64)
-
-    u, f = measured[:, 0], measured[:, 1]
-    return ArmLaw(regression(_rows(u), away[:, 0]), regression(_rows(u, f), away[:, 1]))
 
 
 def turn_arms(positions: FloatArray, axes: FloatArray, directions: Directions) -> FloatArray:

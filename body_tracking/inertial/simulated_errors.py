@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -97,16 +97,3 @@ Data sheet PS-MPU-9250A-01: 0.01 deg/s and 300 ug per root hertz, ranges; 3 % sc
 taken as three standard deviations and less, for a sensor that was calibrated once. Turn-on biases are those by a change
 of temperature of 1 to 7 K since the calibration (0.24 deg/s and 1.5 mg per kelvin).
 """
-
-IDEAL: Final = replace(
-    CONSUMER,
-    **{
-        item.name: np.inf if item.name.endswith("_range") else 0.0
-        for item in fields(ImuErrors)
-        if item.name.startswith(("gyro", "acc", "mag", "driver", "stated"))
-        or item.name in ("misalignment", "tissue_sag", "twist_share", "jitter", "stamp_jitter")
-        or item.name in ("lost", "outages", "delay", "delay_jitter")
-    },
-    packet=1,
-)
-"""No errors; acceleration and iron still affect a driver's fusion."""

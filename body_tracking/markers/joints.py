@@ -8,7 +8,6 @@ kind.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
@@ -22,8 +21,7 @@ from body_tracking.markers.chain_likelihood import maximise
 from body_tracking.markers.joint_model import Joint, JointKind
 from body_tracking.markers.joint_starts import closed_form
 from body_tracking.markers.joint_tree import tree_of
-from body_tracking.markers.observations import TargetPose
-from body_tracking.markers.pose_table import PoseTable, pose_table
+from body_tracking.markers.pose_table import PoseTable
 
 MIN_FRAMES: Final = 10
 """Least number of frames with both targets."""
@@ -40,7 +38,7 @@ NOT_RIGID: Final = 3.0
 
 
 class JointFitError(BodyTrackingError):
-    """Raised for too few frames with both targets, or sequences of different lengths."""
+    """Raised for too few frames with both targets."""
 
 
 class Verdict(StrEnum):
@@ -86,43 +84,6 @@ class JointFit:
     warnings: tuple[str, ...]
 
 
-def fit_ball_joint(parent: Sequence[TargetPose], child: Sequence[TargetPose], name: str = "joint") -> JointFit:
-    """A ball joint (Gaschler section 5.1: figures 5.1-5.2, eq. 5.1).
-
-    Args:
-        parent: n poses of the target before the joint.
-        child: n poses of the target behind it, with the stamps and frames of the parent's.
-        name: of the joint.
-
-    Raises:
-        JointFitError: fewer than :data:`MIN_FRAMES` frames, different numbers of poses, or several targets in a
-            sequence.
-        PoseTableError: as :func:`body_tracking.markers.pose_table.pose_table`.
-    """
-    return _fit(JointKind.BALL, parent, child, name)
-
-
-def fit_hinge_joint(parent: Sequence[TargetPose], child: Sequence[TargetPose], name: str = "joint") -> JointFit:
-    """A hinge (Gaschler section 5.2: figure 5.5, eq. 5.8-5.9); see :func:`fit_ball_joint`."""
-    return _fit(JointKind.HINGE, parent, child, name)
-
-
-def fit_universal_joint(parent: Sequence[TargetPose], child: Sequence[TargetPose], name: str = "joint") -> JointFit:
-    """Two perpendicular axes that meet; see :func:`fit_ball_joint`."""
-    return _fit(JointKind.UNIVERSAL, parent, child, name)
-
-
-def _fit(kind: JointKind, parent: Sequence[TargetPose], child: Sequence[TargetPose], name: str) -> JointFit:
-    names = sorted({pose.name for pose in parent}), sorted({pose.name for pose in child})
-    if len(parent) != len(child) or len(names[0]) != 1 or len(names[1]) != 1 or names[0] == names[1]:
-        raise JointFitError(
-            f"joint {name}: {len(parent)} poses of {', '.join(names[0])} and {len(child)} of {', '.join(names[1])}; "
-            "expected as many of two targets"
-        )
-    targets = names[0][0], names[1][0]
-    return fit_joint(name, kind, pose_table(list(zip(parent, child, strict=True)), targets), *targets)
-
-
 def relative_poses(poses: PoseTable) -> tuple[FloatArray, FloatArray]:
     """Rotations (n, 3, 3) and translations (n, 3) of the second target of a table in its first."""
     inverse = poses.rotations[:, 0].swapaxes(-1, -2)
@@ -131,7 +92,10 @@ def relative_poses(poses: PoseTable) -> tuple[FloatArray, FloatArray]:
 
 
 def fit_joint(name: str, kind: JointKind, poses: PoseTable, parent: str, child: str) -> JointFit:
-    """A joint of a given kind between two targets of a table; see :func:`fit_ball_joint`.
+    """A joint of a given kind between two targets of a table.
+
+    A ball joint: Gaschler section 5.1, figures 5.1-5.2, eq. 5.1. A hinge: section 5.2, figure 5.5, eq. 5.8-5.9. A
+    universal joint has two perpendicular axes that meet.
 
     Raises:
         JointFitError: fewer than :data:`MIN_FRAMES` frames with both targets.

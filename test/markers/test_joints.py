@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from joint_pairs import fit_pair
 from marker_people import columns, measured, pair, pose_covariances, random_posture
 from markers_functional import EPICONDYLES, PELVIS, SHANK, THIGH, axis_angle, cluster, markers
 from scipy.spatial.transform import Rotation
@@ -20,19 +21,11 @@ from body_tracking.markers.joints import (
     JointFit,
     JointFitError,
     Verdict,
-    fit_ball_joint,
-    fit_hinge_joint,
-    fit_universal_joint,
 )
 from body_tracking.markers.observations import TargetPose
 from body_tracking.markers.pose_table import PoseTableError
 from draws import draws, some
 
-FITS = {
-    JointKind.BALL: fit_ball_joint,
-    JointKind.HINGE: fit_hinge_joint,
-    JointKind.UNIVERSAL: fit_universal_joint,
-}
 CENTRES = [0, 1, 2, 6, 7, 8]
 
 
@@ -96,7 +89,7 @@ def test_errors_are_as_large_as_stated(kind: JointKind) -> None:
     errors, deviations = [], []
     for seed in range(count):
         truth, poses = drawn(100 + seed, kind, 400, 60.0)
-        fit = FITS[kind](*poses)
+        fit = fit_pair(kind, *poses)
         assert fit.verdict is Verdict.GOOD and not fit.warnings
         error, covariance = fit.joint.difference(truth), fit.joint.covariance
         values, vectors = np.linalg.eigh(covariance)
@@ -118,7 +111,7 @@ def test_a_recording_of_2000_frames_reaches_the_bars(kind: JointKind) -> None:
     errors, deviations = [], []
     for seed in range(draws(8, 30)):
         truth, poses = drawn(500 + seed, kind, 2000, 60.0)
-        fit = FITS[kind](*poses)
+        fit = fit_pair(kind, *poses)
         errors.append(fit.joint.difference(truth))
         deviations.append(np.sqrt(fit.joint.covariance.diagonal()))
     found, stated = parts(kind, np.array(errors)), parts(kind, np.array(deviations))
@@ -133,7 +126,7 @@ def test_a_small_motion_is_reported_and_its_deviations_hold(kind: JointKind) -> 
     errors, variances = [], []
     for seed in range(draws(5, 60)):
         truth, poses = drawn(200 + seed, kind, draws(300, 1000), 3.0)
-        fit = FITS[kind](*poses)
+        fit = fit_pair(kind, *poses)
         assert fit.verdict is Verdict.SMALL_MOTION and "deg RMS only" in fit.warnings[0]
         where = CENTRES if kind is JointKind.UNIVERSAL else slice(None)  # its axes are off by tens of degrees
         errors.append(fit.joint.difference(truth)[where])
@@ -150,7 +143,7 @@ def test_still_targets_determine_no_joint(kind: JointKind, noise: float) -> None
     rng = np.random.default_rng(5)
     tree = pair(rng, kind)
     poses = columns(measured(rng, tree, random_posture(rng, tree, 20, 0.0), scale=noise))
-    fit = FITS[kind](*poses)
+    fit = fit_pair(kind, *poses)
     assert fit.verdict in (Verdict.SMALL_MOTION, Verdict.ONE_AXIS)
     deviation = np.sqrt(fit.joint.covariance.diagonal())
     assert np.linalg.norm(deviation[:3]) > 0.1
@@ -161,7 +154,7 @@ def test_still_targets_determine_no_joint(kind: JointKind, noise: float) -> None
 def test_a_ball_joint_turned_about_one_axis_is_known_up_to_a_line() -> None:
     for seed in range(draws(2, 20)):
         truth, poses = drawn(seed, JointKind.BALL, 200, 40.0, about=1)
-        fit = fit_ball_joint(*poses)
+        fit = fit_pair(JointKind.BALL, *poses)
         assert fit.verdict is Verdict.ONE_AXIS and "up to a line" in fit.warnings[0]
         covariance = fit.joint.covariance[np.ix_(CENTRES, CENTRES)]
         values, vectors = np.linalg.eigh(covariance)
@@ -173,7 +166,7 @@ def test_a_ball_joint_turned_about_one_axis_is_known_up_to_a_line() -> None:
 @pytest.mark.slow
 def test_a_pronating_elbow_is_no_hinge_but_a_universal_joint() -> None:
     _, poses = drawn(7, JointKind.UNIVERSAL, 150, 30.0)
-    hinge, universal = fit_hinge_joint(*poses), fit_universal_joint(*poses)
+    hinge, universal = fit_pair(JointKind.HINGE, *poses), fit_pair(JointKind.UNIVERSAL, *poses)
     assert hinge.verdict is Verdict.NOT_OF_KIND and "soft tissue" in hinge.warnings[0]
     assert hinge.scale > 10.0 and np.degrees(hinge.turn) > 3.0
     assert universal.verdict is Verdict.GOOD and universal.scale < 1.2
@@ -182,7 +175,7 @@ def test_a_pronating_elbow_is_no_hinge_but_a_universal_joint() -> None:
 def test_a_target_that_is_not_rigid_is_refused() -> None:
     _, (parent, child) = drawn(8, JointKind.BALL, 200, 40.0)
     child = [replace(pose, residual=5.0 * pose.residual) for pose in child]
-    fit = fit_ball_joint(parent, child)
+    fit = fit_pair(JointKind.BALL, parent, child)
     assert fit.verdict is Verdict.NOT_RIGID and "lower is not rigid" in fit.warnings[0]
 
 
@@ -199,7 +192,10 @@ def test_the_frame_of_the_cameras_does_not_matter() -> None:
             covariance=both @ pose.covariance @ both.T,
         )
 
-    here, there = fit_hinge_joint(*poses), fit_hinge_joint(*[[moved(pose) for pose in column] for column in poses])
+    here, there = (
+        fit_pair(JointKind.HINGE, *poses),
+        fit_pair(JointKind.HINGE, *[[moved(pose) for pose in column] for column in poses]),
+    )
     deviation = np.sqrt(here.joint.covariance.diagonal())
     assert (np.abs(there.joint.difference(here.joint)) < 0.02 * deviation).all()
     assert np.allclose(np.sqrt(there.joint.covariance.diagonal()), deviation, rtol=0.02)
@@ -208,11 +204,7 @@ def test_the_frame_of_the_cameras_does_not_matter() -> None:
 def test_unusable_input_is_refused_by_name() -> None:
     _, (parent, child) = drawn(10, JointKind.BALL, 30, 40.0)
     with pytest.raises(JointFitError, match="9 frames"):
-        fit_ball_joint(parent[:9], child[:9])
-    with pytest.raises(JointFitError, match="30 poses of upper and 29 of lower"):
-        fit_ball_joint(parent, child[:-1])
-    with pytest.raises(JointFitError, match="two targets"):
-        fit_ball_joint(parent, parent)
+        fit_pair(JointKind.BALL, parent[:9], child[:9])
     for change, named in (
         ({"stamp_ns": 1}, "stamp 1"),
         ({"rotation": np.full((3, 3), np.nan)}, "not finite"),
@@ -222,7 +214,7 @@ def test_unusable_input_is_refused_by_name() -> None:
     ):
         wrong = [*child[:4], replace(child[4], **change), *child[5:]]
         with pytest.raises(PoseTableError, match=named) as caught:
-            fit_ball_joint(parent, wrong)
+            fit_pair(JointKind.BALL, parent, wrong)
         assert "frame 4, target lower" in str(caught.value)
 
 
@@ -242,9 +234,9 @@ def knee(shared_data: Path) -> tuple[JointFit, JointFit, JointFit]:
     thigh, shank = real(shared_data, "right_knee.c3d", THIGH, SHANK)
     half = len(thigh) // 2
     return (
-        fit_hinge_joint(thigh, shank, "knee"),
-        fit_hinge_joint(thigh[:half], shank[:half], "knee"),
-        fit_hinge_joint(thigh[half:], shank[half:], "knee"),
+        fit_pair(JointKind.HINGE, thigh, shank, "knee"),
+        fit_pair(JointKind.HINGE, thigh[:half], shank[:half], "knee"),
+        fit_pair(JointKind.HINGE, thigh[half:], shank[half:], "knee"),
     )
 
 
@@ -260,9 +252,9 @@ def test_a_real_knee_is_the_same_hinge_in_both_halves_of_a_trial(shared_data: Pa
 def test_a_real_hip_shows_soft_tissue_and_a_cluster_that_is_not_rigid(shared_data: Path) -> None:
     found = real(shared_data, "right_hip.c3d", PELVIS, THIGH, THIGH + EPICONDYLES)
     pelvis, thigh, wrong = (poses[::4] for poses in found)
-    hip = fit_ball_joint(pelvis, thigh, "hip")
+    hip = fit_pair(JointKind.BALL, pelvis, thigh, "hip")
     assert "soft tissue" in hip.warnings[0] and 3e-3 < hip.gap < 20e-3
-    assert fit_ball_joint(pelvis, wrong, "hip").verdict is Verdict.NOT_RIGID
+    assert fit_pair(JointKind.BALL, pelvis, wrong, "hip").verdict is Verdict.NOT_RIGID
 
 
 def test_real_elbows_that_hardly_bend_give_no_hinge(shared_data: Path) -> None:
@@ -274,4 +266,4 @@ def test_real_elbows_that_hardly_bend_give_no_hinge(shared_data: Path) -> None:
     for side in ("L", "R"):
         upper = cluster(trial, (f"{side}SHO", f"{side}UPA", f"{side}ELB"))
         lower = cluster(trial, (f"{side}FRM", f"{side}WRA", f"{side}WRB"))
-        assert fit_hinge_joint(upper, lower, "elbow").verdict is Verdict.SMALL_MOTION
+        assert fit_pair(JointKind.HINGE, upper, lower, "elbow").verdict is Verdict.SMALL_MOTION
