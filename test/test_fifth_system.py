@@ -67,15 +67,23 @@ def test_a_folder_is_a_system_live_and_offline(tmp_path: Path, t_pose: Path) -> 
 
 
 def test_its_topic_parameter_option_and_layer_are_among_the_graphs() -> None:
-    said = command("body_tracking.cli", "up", "--help")
-    assert "--height-margin METRES" in said
-    assert "heights:" in command("body_tracking.nodes", "parameters")
-    line = "from body_tracking import systems as s; print([t.name for t in s.TOPICS], [x.name for x in s.LAYERS])"
+    script = (
+        "from body_tracking import cli, systems as s; print(s.config_text()); "
+        "print('@', [t.name for t in s.TOPICS], [x.name for x in s.LAYERS], flush=True); cli.main(['up', '--help'])"
+    )
     path = os.pathsep.join([str(ROOT), str(ROOT / "examples" / "fifth_system")])
     done = subprocess.run(
-        [sys.executable, "-c", line], env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, check=True
+        [sys.executable, "-c", script],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=True,
     )
-    assert HEIGHT in done.stdout and done.stdout.rstrip().endswith("['heights']")
+    parameters, _, after = done.stdout.partition("\n@ ")
+    names, _, options = after.partition("\n")
+    assert "heights:" in parameters
+    assert HEIGHT in names and names.endswith("['heights']")
+    assert "--height-margin METRES" in options
 
 
 def test_a_broken_system_is_named_and_left_out(tmp_path: Path) -> None:

@@ -295,6 +295,7 @@ def two_people(folder: Path) -> tuple[Path, Path]:
     return folder / "people", folder / "true.yaml"
 
 
+@pytest.mark.slow
 def test_two_people_are_the_same_live_and_offline(tmp_path: Path) -> None:
     bag, calibration = two_people(tmp_path)
     settings = ReplaySettings(

@@ -130,6 +130,24 @@ def test_fused_skeletons_are_judged_where_asked_or_where_there_are_no_others(
     assert alone.topic == "/fused/skeleton" and alone.angles is None and len(alone.stamps_ns) == 3
 
 
+@pytest.fixture(scope="module")
+def places(replayed_wave: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Recordings and files by name."""
+    folder = tmp_path_factory.mktemp("places")
+    (folder / "notes.txt").write_text("no recording")
+    return {
+        "wave": replayed_wave,
+        "twist": BAGS / "tpose_torso_twist",
+        "reaching": BAGS / "camera_reaching",
+        "text": folder / "notes.txt",
+        "nowhere": folder / "nowhere",
+        "empty": bag_of(folder / "empty", 0),
+        "one": bag_of(folder / "one", 1),
+        "two": bag_of(folder / "two", 2),
+        "angles": bag_of(folder / "angles", 1, "/humans/bodies/markers/joint_states", JOINT_STATE),
+    }
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -159,21 +177,8 @@ def test_fused_skeletons_are_judged_where_asked_or_where_there_are_no_others(
     ],
 )
 def test_bad_input_is_reported_in_one_line(
-    arguments: list[str], message: str, replayed_wave: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    arguments: list[str], message: str, places: dict[str, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    text = tmp_path / "notes.txt"
-    text.write_text("no recording")
-    places = {
-        "wave": replayed_wave,
-        "twist": BAGS / "tpose_torso_twist",
-        "reaching": BAGS / "camera_reaching",
-        "text": text,
-        "nowhere": tmp_path / "nowhere",
-        "empty": bag_of(tmp_path / "empty", 0),
-        "one": bag_of(tmp_path / "one", 1),
-        "two": bag_of(tmp_path / "two", 2),
-        "angles": bag_of(tmp_path / "angles", 1, "/humans/bodies/markers/joint_states", JOINT_STATE),
-    }
     assert main(["evaluate", *(argument.format(**places) for argument in arguments)]) == 2
     captured = capsys.readouterr()
     assert captured.err.startswith("body_tracking: ") and captured.err.count("\n") == 1

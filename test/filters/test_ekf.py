@@ -295,7 +295,7 @@ def arm_elsewhere(rng: np.random.Generator) -> tuple[list[Joint], FloatArray]:
 def test_a_pose_that_jumps_states_how_far() -> None:
     """After a jump the deviations say that either pose may be wrong: a camera moves an arm elsewhere for 0.6 s."""
     jumps, misleading = 0, 0
-    for seed in range(draws(5, 60)):
+    for seed in range(draws(3, 60)):
         truth = random_truth(seed, 3.2)
         arm, offset = arm_elsewhere(np.random.default_rng([seed, 7]))
         estimator, angles = ExtendedKalmanFilter(), None
@@ -313,7 +313,7 @@ def test_a_pose_that_jumps_states_how_far() -> None:
         jumps += int(far.sum())
         misleading += int((far & (np.maximum(stddev[1:], stddev[:-1]) < np.radians(15.0))).sum())
     # 2 of 188 over 60 people: a shoulder's angles switch to the equivalent triple
-    assert jumps >= 10 and misleading <= 0.02 * jumps, (jumps, misleading)
+    assert jumps >= draws(6, 120) and misleading <= 0.02 * jumps, (jumps, misleading)
 
 
 def test_one_sensor_that_sees_an_arm_elsewhere_does_not_move_it_there() -> None:
@@ -376,7 +376,7 @@ def test_a_shoulder_that_rises_is_followed_although_its_joint_centre_is_offset()
     q[:, clavicles] = raised[:, None]
     stated = np.broadcast_to(np.eye(3), (N_JOINTS, 3, 3)) * BASE_STDDEV[:, None, None] ** 2
     followed = []
-    for seed in range(draws(2, 16)):
+    for seed in range(draws(1, 16)):
         rng = np.random.default_rng(70 + seed)
         points = np.full((len(times), N_JOINTS, 3), np.nan)
         points[:, POINTS] = MODEL.linearise(q, RandomPerson.draw(rng).lengths).posture.positions

@@ -53,6 +53,7 @@ def test_a_real_arm_comes_back_to_where_it_was_aligned(shared_data: Path, imu_re
     assert figures["last_deg"] < 5.0
 
 
+@pytest.mark.slow
 def test_sensors_on_an_arm_do_not_hide_how_the_person_twists(tmp_path: Path) -> None:
     """The twist was halved where the slow errors of the two shoulders, and hips, were independent: 10.8 degrees off.
 

@@ -124,7 +124,7 @@ def test_a_slip_by_20_degrees_is_named() -> None:
 def test_two_exchanged_sensors_are_reported_and_reassigned(wrists: Fed) -> None:
     assert wrists.tracker.counters["exchanged sensors"] == 0
     crossed = sensor("forearm_left", "forearm_right"), sensor("forearm_right", "forearm_left")
-    fed = feed(recorded("reaching", crossed, SECONDS, seed=4), seconds=20.0)
+    fed = feed(recorded("reaching", crossed, SECONDS, seed=4), seconds=16.0)
     assert fed.tracker.counters["exchanged sensors"] == 2
     assert "forearm_left: its sensor is on forearm_right" in lines(fed, 14.0)
     assert "forearm_right: its sensor is on forearm_left" in lines(fed, 14.0)
@@ -152,7 +152,7 @@ def test_a_magnetic_disturbance_is_named_and_covered(oriented: bool) -> None:
             return sample
         return replace(sample, magnetic_field=sample.magnetic_field + np.array([3e-5, -2e-5, 2e-5]))
 
-    fed = feed(recorded("reaching", imus, SECONDS, seed=3), meddle=iron, seconds=18.0)
+    fed = feed(recorded("reaching", imus, SECONDS, seed=3), meddle=iron, seconds=16.5)
     assert any(line == "forearm_left: magnetic field disturbed" for line in lines(fed, 9.0, 16.0))
     assert not any("disturbed" in line for line in lines(fed, 0.0, 7.9))
     assert covered(fed, "forearm_left", 8.0).mean() > 0.95

@@ -190,6 +190,7 @@ def test_a_real_person_who_turns_before_the_camera_is_never_lost(turning: tuple[
     assert abs(turned[-1] - turned[0]) == pytest.approx(355.0, abs=15.0)
 
 
+@pytest.mark.slow
 def test_the_thorax_of_a_real_person_turns_as_the_camera_around_them(turning: tuple[MeshTracker, list[Path]]) -> None:
     """Without starts with a wide scale the fit stays half a view behind for six views, and this is 6.0 degrees."""
     tracker, files = turning

@@ -504,15 +504,18 @@ def test_inertial_sensors_without_a_pose_are_named(tmp_path: Path, command: Comm
     assert not (tmp_path / "out").exists()
 
 
-def test_what_a_calibration_lacks_and_what_no_option_takes_is_named(tmp_path: Path, command: Command) -> None:
-    brief, file = beginning(BAG, tmp_path / "brief", 2.0), tmp_path / "lab.yaml"
-    assert command("calibrate", BAG, "-o", file)[0] == 0
+def test_what_a_calibration_lacks_and_what_no_option_takes_is_named(
+    wave: Path, tmp_path: Path, command: Command
+) -> None:
+    brief, file = beginning(BAG, tmp_path / "brief", 1.0), tmp_path / "lab.yaml"
+    with_imus = beginning(ROOT / "bags" / "mesh_reaching", tmp_path / "with_imus", 1.0)
+    assert command("calibrate", wave, "-o", file)[0] == 0
     file.write_text(file.read_text().replace("kinect2", "kinect9"))
     code, _, reported = command("replay", brief, "-o", tmp_path / "out", "--calibration", file)
     assert code == 0 and "lab.yaml; it has kinect1, kinect9, but not kinect2" in reported
-    code, printed, _ = command("replay", ROOT / "bags" / "mesh_reaching", "-o", tmp_path / "skeletons")
+    code, printed, _ = command("replay", with_imus, "-o", tmp_path / "skeletons")
     assert code == 0 and "not taken without an option: --imus: forearm_left, forearm_right" in printed
-    code, _, reported = command("calibrate", ROOT / "bags" / "mesh_reaching")
+    code, _, reported = command("calibrate", with_imus)
     assert code == 2 and "only the sensor kinect1" in reported
 
 
