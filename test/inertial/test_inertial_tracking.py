@@ -124,7 +124,7 @@ def test_a_slip_by_20_degrees_is_named() -> None:
 def test_two_exchanged_sensors_are_reported_and_reassigned(wrists: Fed) -> None:
     assert wrists.tracker.counters["exchanged sensors"] == 0
     crossed = sensor("forearm_left", "forearm_right"), sensor("forearm_right", "forearm_left")
-    fed = feed(recorded("reaching", crossed, SECONDS, seed=4), seconds=16.0)
+    fed = feed(recorded("reaching", crossed, SECONDS, seed=4), seconds=20.0)
     assert fed.tracker.counters["exchanged sensors"] == 2
     assert "forearm_left: its sensor is on forearm_right" in lines(fed, 14.0)
     assert "forearm_right: its sensor is on forearm_left" in lines(fed, 14.0)
