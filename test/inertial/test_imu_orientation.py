@@ -20,9 +20,10 @@ from body_tracking.inertial.imu_orientation import (
     OrientationEstimator,
 )
 from body_tracking.inertial.simulated import ImuSamples, Mounting, SimulatedImu
-from body_tracking.inertial.simulated_errors import CONSUMER, IDEAL, ImuErrors
+from body_tracking.inertial.simulated_errors import CONSUMER, ImuErrors
 from body_tracking.inertial.surroundings import Iron, Surroundings
 from draws import draws, some
+from ideal_sensors import IDEAL
 
 START_NS = 1_700_000_000 * NANOSECONDS
 STILL_RADIO = {"lost": 0.0, "outages": 0.0}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -28,23 +28,12 @@ from body_tracking.kinematics.trajectories import minimum_jerk
 from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.random_motion import RandomMotion
 from draws import draws, some
+from ideal_sensors import IDEAL
 
 UP = np.array([0.0, 0.0, 1.0])
 AT_ORIGIN = Mounting(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
 START_NS = 1_700_000_000 * NANOSECONDS
 SEEDS = st.integers(0, 2**32 - 1)
-IDEAL = replace(
-    CONSUMER,
-    **{
-        item.name: np.inf if item.name.endswith("_range") else 0.0
-        for item in fields(ImuErrors)
-        if item.name.startswith(("gyro", "acc", "mag", "driver", "stated"))
-        or item.name in ("misalignment", "tissue_sag", "twist_share", "jitter", "stamp_jitter")
-        or item.name in ("lost", "outages", "delay", "delay_jitter")
-    },
-    packet=1,
-)
-"""No errors; acceleration and iron still affect a driver's fusion."""
 
 
 @dataclass(frozen=True, eq=False)
