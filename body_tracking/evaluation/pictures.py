@@ -107,8 +107,10 @@ def figure_of(height: float) -> Any:
 
 
 def png_of(figure: Any) -> bytes:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # as in figure_of
+
     data = io.BytesIO()
-    figure.savefig(data, format="png")
+    FigureCanvasAgg(figure).print_png(data)  # savefig draws the figure twice, the first time for its layout
     return data.getvalue()
 
 
