@@ -434,6 +434,7 @@ def test_two_sensors_are_better_than_either_and_the_better_one_counts_more() -> 
     assert both < good < poor
 
 
+@pytest.mark.slow
 def test_what_a_sensor_states_to_be_poor_does_not_count_as_good_because_it_was_good_before() -> None:
     """Two sensors err by less than they state, which the filter learns; then one states three times the deviation.
 

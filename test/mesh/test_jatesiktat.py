@@ -179,6 +179,7 @@ def test_the_fit_finds_a_pose_from_a_kinects_wrong_skeleton(fitter: JatesiktatFi
     assert off(fitter, found.theta, pose).mean() < 0.02
 
 
+@pytest.mark.slow
 def test_the_fit_from_several_starts_is_the_best_of_them() -> None:
     brief = JatesiktatFitter(body_model.load().body(), jatesiktat.Configuration(iterations=3))
     frame = frame_of(brief, posed())

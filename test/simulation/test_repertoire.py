@@ -121,7 +121,7 @@ def test_walking_always_has_a_foot_that_does_not_slide(name: str, seed: int) -> 
     assert speeds.max() > 0.5
 
 
-@pytest.mark.parametrize("name", some(list(MOTIONS), 3))
+@pytest.mark.parametrize("name", some(list(MOTIONS), 2))
 def test_accelerations_are_continuous(name: str) -> None:
     """A jump of the acceleration makes third differences grow with the rate; bounded jerk does not."""
     person, movement = performance(name, 5)
