@@ -110,7 +110,8 @@ def png_of(figure: Any) -> bytes:
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # as in figure_of
 
     data = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(data)  # savefig draws the figure twice, the first time for its layout
+    # savefig draws the figure twice, the first time for its layout
+    FigureCanvasAgg(figure).print_png(data)  # type: ignore[no-untyped-call]
     return data.getvalue()
 
 
