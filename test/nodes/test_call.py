@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import os
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
@@ -15,6 +19,7 @@ rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 from running import Running  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
+from body_tracking import cli  # noqa: E402
 from body_tracking.pipeline import graph  # noqa: E402
 from body_tracking.ros import triggers  # noqa: E402
 from body_tracking.ros.call import CallError  # noqa: E402
@@ -37,10 +42,14 @@ class Rigs(Running):
         self.node.create_client(Trigger, f"/{graph.ALIGN_SERVICE}")
 
     def say(self, *words: str) -> tuple[int, str, str]:
-        """Exit code, output and error output of ``body_tracking call``."""
-        command = [sys.executable, "-m", "body_tracking.cli", "call", *words]
-        done = subprocess.run(command, env=self.environment, capture_output=True, text=True, timeout=60)
-        return done.returncode, done.stdout, done.stderr
+        """Exit code, output and error output of ``body_tracking call``, in this process."""
+        with (
+            patch.dict(os.environ, self.environment),
+            contextlib.redirect_stdout(io.StringIO()) as out,
+            contextlib.redirect_stderr(io.StringIO()) as err,
+        ):
+            code = cli.main(["call", *words])
+        return code, out.getvalue(), err.getvalue()
 
 
 @pytest.fixture(scope="module")
@@ -75,6 +84,12 @@ def test_services_are_listed_with_what_they_do(rigs: Rigs) -> None:
 def test_a_node_answers(rigs: Rigs, words: list[str]) -> None:
     code, printed, error = rigs.say(*words)
     assert code == 0 and printed.startswith("calibrating: ") and not error
+
+
+def test_the_command_as_a_process(rigs: Rigs) -> None:
+    command = [sys.executable, "-m", "body_tracking.cli", "call", "calibration/start"]
+    done = subprocess.run(command, env=rigs.environment, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0 and done.stdout.startswith("calibrating: ") and not done.stderr
 
 
 @pytest.mark.parametrize(
