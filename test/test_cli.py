@@ -105,6 +105,7 @@ def test_missing_files_are_reported_in_one_line(
             "unrecognized arguments: --filtre ekf; did you mean '--filter'?",
             "body_tracking replay",
         ),
+        ("up bags/wave", "unrecognized arguments: bags/wave; did you mean '--bag bags/wave'?", "body_tracking up"),
         ("up --rate fast", "argument --rate: invalid float value: 'fast'", "body_tracking up"),
         ("replay bag", "the following arguments are required: -o/--output", "body_tracking replay"),
         ("camera show image.png -o out.png --large", "unrecognized arguments: --large", "body_tracking camera show"),

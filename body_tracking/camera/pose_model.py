@@ -11,6 +11,9 @@ these networks.
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
@@ -254,6 +257,19 @@ def _in_heatmap(cells: IntArray) -> BoolArray:
     return (cells >= 0) & (cells < _HEATMAP_PIXELS)
 
 
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Drop the lines about itself that TensorFlow Lite writes to the process's stderr; its errors are exceptions."""
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+
+
 class _Network:
     """A file of TensorFlow Lite: called with an image, returns its outputs."""
 
@@ -265,8 +281,9 @@ class _Network:
         if not file.is_file():
             raise PoseModelError(f"no file {file}: `body_tracking camera model` fetches it")
         try:
-            self._interpreter = Interpreter(str(file), num_threads=threads)
-            self._interpreter.allocate_tensors()
+            with _quiet():
+                self._interpreter = Interpreter(str(file), num_threads=threads)
+                self._interpreter.allocate_tensors()
         except (ValueError, RuntimeError) as error:
             raise PoseModelError(f"{file}: {' '.join(str(error).split())}") from error
         (given,) = self._interpreter.get_input_details()

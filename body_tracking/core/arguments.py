@@ -20,6 +20,8 @@ class Parser(argparse.ArgumentParser):
         found, unknown = super().parse_known_args(args, namespace)
         if unknown:
             hint = did_you_mean(unknown[0], self._option_string_actions)
+            if "--bag" in self._option_string_actions and not unknown[0].startswith("-"):
+                hint = f"; did you mean '--bag {unknown[0]}'?"
             self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
         return found, unknown
 

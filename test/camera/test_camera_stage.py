@@ -24,7 +24,7 @@ from body_tracking.pipeline.graph import GraphError
 from body_tracking.pipeline.stage import Now, Output
 from body_tracking.simulation.camera_bags import SECONDS
 from body_tracking.systems import nodes_for, options_of
-from pose_networks import MISSING, REASON
+from pose_networks import FOLDER, MISSING, REASON
 
 networks = pytest.mark.skipif(bool(MISSING), reason=REASON)
 SEEN = [Joint[f"{name}_{side}"] for side in ("LEFT", "RIGHT") for name in ("SHOULDER", "ELBOW", "WRIST", "KNEE")]
@@ -269,6 +269,12 @@ def test_missing_and_foreign_networks_are_named(tmp_path: Path) -> None:
     (tmp_path / "pose_detection.tflite").write_bytes(b"no network")
     with pytest.raises(PoseModelError, match=r"pose_detection.tflite"):
         PoseModel(tmp_path)
+
+
+@networks
+def test_networks_load_without_a_line_on_the_terminal(capfd: pytest.CaptureFixture[str]) -> None:
+    PoseModel(FOLDER)
+    assert capfd.readouterr() == ("", "")
 
 
 @networks
