@@ -199,6 +199,7 @@ def test_a_bag_writes_a_calibration_only_where_there_was_none(
     (log,) = tmp_path.glob("body_tracking_up_*/calibration.log")
     assert (file.read_text() == before) is kept
     assert (f"{file}: loaded, not to be written" in log.read_text()) is kept
+    assert (f"{file}: only loaded, as a bag plays" in graph_up.text()) is kept
 
 
 @pytest.mark.parametrize("how", some([signal.SIGKILL, signal.SIGTERM]))

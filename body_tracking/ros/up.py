@@ -613,6 +613,8 @@ def supervise(
     """
     options = options_for(args, found)
     specs = nodes_for(options)
+    if any(spec.parameters.get("save") is False for spec in specs):
+        print(f"{options['calibration']}: only loaded, as a bag plays", flush=True)
     if args.bag is not None:
         with RigReader(args.bag) as reader:
             others = unused({name: each.type_name for name, each in reader.topics.items()}, options)
