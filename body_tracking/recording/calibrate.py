@@ -96,8 +96,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """``body_tracking calibrate``."""
     command = subparsers.add_parser(
         "calibrate",
-        description="Estimates the pose and clock of each sensor of a recording from the skeletons of a person, and says "
-        "whether they are good enough.",
+        description="Estimates the pose and clock of each sensor of a recording from the skeletons of a person, and "
+        "says whether they are good enough.",
     )
     command.add_argument(
         "bag", type=Path, metavar="BAG", help="rosbag2 folder or .mcap file with /<sensor>/skeleton topics"
