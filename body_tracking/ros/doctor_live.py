@@ -90,7 +90,8 @@ def domain(sensors: Sequence[str], seconds: float = 3.0) -> Iterator[Finding]:
                 end = min(now, began + PATIENCE) + seconds
         others = set(node.get_node_names()) - {node.get_name()}
         remedy = "start body_tracking up; where it runs, compare env | grep ROS_ there, and look for firewall and VPN"
-        yield Finding(OK if others else WARNING, f"{len(others)} other nodes in this domain", "" if others else remedy)
+        found = f"{len(others)} other node{'' if len(others) == 1 else 's'} in this domain"
+        yield Finding(OK if others else WARNING, found, "" if others else remedy)
         topics = dict.fromkeys(wanted, ()) | dict(node.get_topic_names_and_types())
         for topic in sorted(topics.keys() - names.WHOLE_DOMAIN | {names.CLOCK}):
             yield from _topic(node, topic, topics[topic], topic in wanted)
