@@ -20,7 +20,7 @@ import numpy as np
 from common import ABSENT, progress, recordings, report, verdicts
 
 from body_tracking.core.skeleton import BoolArray, SingleArray
-from body_tracking.mesh.depth import JUMP, LEAST, DepthCamera, axial_noise, supported, to_metres
+from body_tracking.mesh.depth import DepthCamera, axial_noise, supported, to_metres
 from body_tracking.mesh.person import PersonFinder
 from body_tracking.simulation.depth_scene import DepthScene, held_out, kinect_camera
 from body_tracking.simulation.makehuman import find_wheel, load
@@ -50,7 +50,7 @@ def statistics(depth: SingleArray, mask: BoolArray) -> dict[str, float]:
             near[row, column] = np.median(depth[block][inner[block]])
     judged = rim & np.isfinite(near)
     off = np.abs(depth - near) > 0.04
-    good = supported(depth, JUMP, LEAST)
+    good = supported(depth)
     return {
         **found,
         "holes": float((~there).mean()),
@@ -95,7 +95,7 @@ def main() -> int:
         "to metres": median_ms(lambda: to_metres(pixels)),
         "person without prediction": median_ms(lambda: finder.find(depth)),
         "person with prediction": median_ms(lambda: finder.find(depth, person)),
-        "flying pixels": median_ms(lambda: supported(depth, JUMP, LEAST)),
+        "flying pixels": median_ms(lambda: supported(depth)),
         "1000 points with normals": median_ms(lambda: view.sample(depth, mask, 1000)),
     }
 

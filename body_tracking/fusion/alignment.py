@@ -68,17 +68,9 @@ class SensorAlignment(PlacedSensors[_Sensor]):
         self.world = world
         self._sides = Sides()
 
-    def reset(self) -> None:
-        """Forget all frames; calibrations stay, and those that wait for their time come into force."""
-        self.forget()
-        for sensor in self._sensors.values():
-            sensor.restart()
-        self.counters["resets"] += 1
-
     def forget(self) -> None:
         """Forget all frames, because the next ones are of another person."""
-        for sensor in self._sensors.values():
-            sensor.clear()
+        super().forget()
         self._sides.reset()
 
     def push(self, sensor: str, skeleton: Skeleton) -> Skeleton | None:
@@ -97,7 +89,12 @@ class SensorAlignment(PlacedSensors[_Sensor]):
         source = self._known(sensor)
         if source is None:
             return None
-        self._check_clock(sensor, source, skeleton.stamp_ns)
+        if jumped_back(skeleton.stamp_ns, source.last_ns):
+            self._clock_jumped_back(sensor)
+        if source.last_ns is None or skeleton.stamp_ns > source.last_ns:
+            source.last_ns = skeleton.stamp_ns
+        else:
+            self.counters["late"] += 1
         stamp = source.stamp(skeleton.stamp_ns)
         if stamp is None:
             self.counters["other_clock"] += 1
@@ -117,19 +114,6 @@ class SensorAlignment(PlacedSensors[_Sensor]):
             source.newest = seen
         self.counters["aligned"] += 1
         return self._corrected(sensor, seen)
-
-    def _check_clock(self, sensor: str, source: _Sensor, stamp_ns: int) -> None:
-        """Reset the sensor, or all for the reference, when its clock jumped back."""
-        if jumped_back(stamp_ns, source.last_ns):
-            if sensor == self.reference:
-                self.reset()
-            else:
-                source.clear()
-                self.counters["resets"] += 1
-        if source.last_ns is None or stamp_ns > source.last_ns:
-            source.last_ns = stamp_ns
-        else:
-            self.counters["late"] += 1
 
     def _in_step(self, sensor: str, stamp_ns: int) -> bool:
         in_step = super()._in_step(sensor, stamp_ns)

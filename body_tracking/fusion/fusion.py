@@ -133,17 +133,9 @@ class Fusion(PlacedSensors[_Sensor]):
         self._rejecting = False
         self._sides = Sides()
 
-    def reset(self) -> None:
-        """Forget all frames; calibrations stay, and those that wait for their time come into force."""
-        self.forget()
-        for sensor in self._sensors.values():
-            sensor.restart()
-        self.counters["resets"] += 1
-
     def forget(self) -> None:
         """Forget all frames, because the next ones are of another person."""
-        for sensor in self._sensors.values():
-            sensor.clear()
+        super().forget()
         self._forget_output()
 
     # --- frames in
@@ -172,11 +164,7 @@ class Fusion(PlacedSensors[_Sensor]):
             if not jumped_back(skeleton.stamp_ns, source.frames[-1].stamp_ns):
                 self.counters["late"] += 1
                 return False
-            if sensor == self.reference:
-                self.reset()
-            else:
-                source.clear()
-                self.counters["resets"] += 1
+            self._clock_jumped_back(sensor)
         stamp = source.stamp(skeleton.stamp_ns)
         if stamp is None or not self._in_step(sensor, stamp):
             self.counters["other_clock"] += 1

@@ -109,6 +109,18 @@ class PlacedSensors(Generic[S]):
         self.counters: Counter[str] = Counter()
         self._sensors: dict[str, S] = {name: kind() for name in sensors}
 
+    def reset(self) -> None:
+        """Forget all frames; calibrations stay, and those that wait for their time come into force."""
+        self.forget()
+        for sensor in self._sensors.values():
+            sensor.restart()
+        self.counters["resets"] += 1
+
+    def forget(self) -> None:
+        """Forget all frames, because the next ones are of another person."""
+        for sensor in self._sensors.values():
+            sensor.clear()
+
     def set_pose(self, pose: SensorPose) -> None:
         """Take a sensor's pose, in force from its ``valid_from_ns``; unknown sensors are counted and ignored."""
         if (sensor := self._known(pose.sensor)) is not None:
@@ -125,6 +137,14 @@ class PlacedSensors(Generic[S]):
         if found is None:
             self.counters["unknown_sensor"] += 1
         return found
+
+    def _clock_jumped_back(self, sensor: str) -> None:
+        """Reset the sensor, or all for the reference."""
+        if sensor == self.reference:
+            self.reset()
+        else:
+            self._sensors[sensor].clear()
+            self.counters["resets"] += 1
 
     def _in_step(self, sensor: str, stamp_ns: int) -> bool:
         """Whether a frame's stamp is consistent with the reference sensor's newest one.

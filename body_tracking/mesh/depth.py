@@ -22,6 +22,11 @@ FARTHEST: Final = 12.0
 _NOISE: Final = (1.13e-3, 0.129e-3)
 """Axial noise of a Kinect v2, standard deviation: constant part in metres, and part per square metre of distance
 squared; 1.5 mm at 1.7 m and 4.1 mm at 4.8 m, measured on a real frame (benchmarks/depth_images.py)."""
+_JUMP: Final = 0.015
+"""Largest depth difference between neighbours on one surface, as a share of the distance: 30 mm at 2 m, a surface at 80
+degrees of grazing (6 mm between pixels)."""
+_LEAST: Final = 6
+"""Least number of the 8 neighbours on the surface of a pixel that is neither on its edge nor flying."""
 
 
 class DepthError(BodyTrackingError):
@@ -217,15 +222,13 @@ def normals_at(
 
 
 @compiled
-def supported(depth: SingleArray, jump: float, least: int) -> BoolArray:
+def supported(depth: SingleArray) -> BoolArray:
     """Mask of pixels on a surface: neither flying pixels nor on a surface's edge.
 
     A flying pixel of a time-of-flight camera averages foreground and background; few neighbours share its distance.
 
     Args:
         depth: (height, width) metres, 0 where missing.
-        jump: largest depth difference between neighbours on one surface, as a share of the distance.
-        least: least number of the 8 neighbours on the pixel's surface.
 
     Returns:
         (height, width); False where depth is missing.
@@ -237,18 +240,12 @@ def supported(depth: SingleArray, jump: float, least: int) -> BoolArray:
             z = depth[i, j]
             if z <= 0.0:
                 continue
-            limit, count = jump * z, 0
+            limit, count = _JUMP * z, 0
             for a in range(i - 1, i + 2):
                 for b in range(j - 1, j + 2):
                     other = depth[a, b]
                     if other > 0.0 and abs(other - z) <= limit:
                         count += 1
             # count includes the pixel itself
-            good[i, j] = count > least
+            good[i, j] = count > _LEAST
     return good
-
-
-JUMP: Final = 0.015
-"""Default of :func:`supported`: 30 mm at 2 m, a surface at 80 degrees of grazing (6 mm between pixels)."""
-LEAST: Final = 6
-"""Default of :func:`supported`."""

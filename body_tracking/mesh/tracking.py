@@ -23,7 +23,7 @@ from body_tracking.core.parameters import number_field
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, Joint, SingleArray, Skeleton, TrackingState
 from body_tracking.mesh.body_index import of_body_index
 from body_tracking.mesh.body_model import Body, Pose, load
-from body_tracking.mesh.depth import JUMP, LEAST, DepthCamera, supported
+from body_tracking.mesh.depth import DepthCamera, supported
 from body_tracking.mesh.energy import Observation, observe
 from body_tracking.mesh.person import COVERED, NOBODY, REACH, PersonFinder, is_covered, near
 from body_tracking.mesh.personalisation import personalise
@@ -368,7 +368,7 @@ def _without_flying(depth: SingleArray, mask: BoolArray) -> SingleArray:
     box = slice(max(top - 2, 0), top + height + 2), slice(max(left - 2, 0), left + width + 2)
     clean = depth.copy()
     block = np.ascontiguousarray(depth[box])
-    clean[box] = np.where(supported(block, JUMP, LEAST), block, np.float32(0.0))
+    clean[box] = np.where(supported(block), block, np.float32(0.0))
     return clean
 
 

@@ -38,8 +38,8 @@ _UPPER_OF_NINE = np.array([0, 1, 2, 4, 5, 8])
 _NINE_OF_UPPER = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
 
 
-def _padded(data: bytes, to: int = 4) -> bytes:
-    return data + bytes(-len(data) % to)
+def _padded(data: bytes) -> bytes:
+    return data + bytes(-len(data) % 4)
 
 
 def _string(text: str) -> bytes:

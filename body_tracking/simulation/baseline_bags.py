@@ -54,11 +54,11 @@ class BaselineError(BodyTrackingError):
     """Raised for arguments of a recording that cannot be simulated."""
 
 
-def capture_times(seconds: float, rng: np.random.Generator, rate: float = _RATE, lost: float = _LOST) -> FloatArray:
+def capture_times(seconds: float, rng: np.random.Generator, rate: float = _RATE) -> FloatArray:
     """(n,) s, increasing, from 0 to ``seconds``: irregular, with lost frames."""
     even = np.arange(round(seconds * rate)) / rate
     times = even + rng.normal(0.0, _JITTER, len(even))
-    kept = np.sort(times[(rng.random(len(even)) >= lost) & (times >= 0.0)])
+    kept = np.sort(times[(rng.random(len(even)) >= _LOST) & (times >= 0.0)])
     return np.asarray(kept[np.diff(kept, prepend=-1.0) > 1e-3])
 
 

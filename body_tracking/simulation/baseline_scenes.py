@@ -65,11 +65,11 @@ def sphere(radius: float, rings: int = 24) -> _Mesh:
     return _turned(radius * np.sin(polar), radius * np.cos(polar), 2 * rings)
 
 
-def rod(radius: float, length: float, around: int = 24) -> _Mesh:
+def rod(radius: float, length: float) -> _Mesh:
     """Vertices and faces of a rod from the origin along z, with flat ends, metres."""
     steps = np.linspace(0.0, length, max(2, int(np.ceil(length / 0.05)) + 1))
     profile = np.array([0.0, *(radius,) * len(steps), 0.0])
-    return _turned(profile, np.array([steps[0], *steps, steps[-1]]), around)
+    return _turned(profile, np.array([steps[0], *steps, steps[-1]]), 24)
 
 
 def _turned(radii: FloatArray, heights: FloatArray, around: int) -> _Mesh:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from depth_shapes import camera, plane, sphere
 
-from body_tracking.mesh.depth import JUMP, LEAST, DepthCamera, DepthError, axial_noise, supported, to_metres
+from body_tracking.mesh.depth import DepthCamera, DepthError, axial_noise, supported, to_metres
 from body_tracking.mesh.raster import render
 
 
@@ -90,14 +90,14 @@ def test_flying_pixels_and_edges_are_left_out_and_surfaces_kept() -> None:
     rim = grown & ~body
     rng = np.random.default_rng(2)
     depth[rim] = rng.uniform(2.0, 2.9, rim.sum())
-    good = supported(depth, JUMP, LEAST)
+    good = supported(depth)
     inner = cv2.erode(body.astype(np.uint8), np.ones((9, 9))) > 0
     assert (
         good[inner].all() and good[~cv2.dilate(rim.astype(np.uint8), np.ones((3, 3))).astype(bool)][600:].mean() > 0.9
     )
     # two neighbours that fly equally far are rare
     assert good[rim].mean() < 0.01
-    assert not supported(np.zeros((20, 20), np.float32), JUMP, LEAST).any()
+    assert not supported(np.zeros((20, 20), np.float32)).any()
 
 
 def test_noise_of_a_real_frame_is_the_stated_one(shared_data: Path) -> None:
