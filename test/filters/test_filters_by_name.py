@@ -132,7 +132,7 @@ def test_a_restarted_filter_equals_a_new_one(name: str, cause: str) -> None:
     if cause == "reset":
         tested.reset()
         assert tested.counters == counted
-    for each in FRAMES[: draws(12, 45)]:
+    for each in FRAMES[: draws(20, 45)]:
         moved = replace(each, stamp_ns=each.stamp_ns + later * NANOSECONDS, frame_id=frame_id)
         assert_alike(tested.update(moved), fresh.update(moved))
     expected = {key: int(key == cause) for key in ("backward_jumps", "frame_changes", "gaps")}
