@@ -104,7 +104,7 @@ def test_from_the_start_page_to_a_recording_and_back(start_page: Browser) -> Non
     page.get_by_label("loop").dispatch_event("click")
     browser.press("play mine")
     browser.reads(r"playing mine, [\d.]+ of 15\.4 s, again and again")
-    browser.reads(r"calibrated: kinect2 to [\d.]+° and \d+ mm")
+    browser.reads(r"calibrated: kinect2 to [\d.]+ degrees and \d+ mm")
     browser.reads(r"fusion\s+\d+ Hz\s+[\d.]+ ms\s+[\d.]+ ms")
     at_both_sizes(browser)
 
