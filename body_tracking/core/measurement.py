@@ -53,6 +53,12 @@ value the twist between shoulders and hips has a deviation of 11 degrees if all 
 times 1.2; independent joints would give 21. A Kinect v2 shows people who face it and move an arm (54 clips of UI-PRMD)
 with twists whose deviation between the clips of one person is 4 to 15 degrees."""
 
+COMMON_SHARE = 0.5
+"""Share of the variance of a joint seen from the front that is the same before every sensor, so that several sensors do
+not reduce it: clothes, and where the recognition places a joint. Two real Kinects side by side show the elevations of
+three people 1 degree apart in the mean and 7 RMS about it, so that each errs by 5 on its own; against Vicon one errs by
+7 (docs/tried.md, "What two sensors err by alike")."""
+
 _LEFT_ENDS = np.array([Joint.SHOULDER_LEFT, Joint.HIP_LEFT], dtype=np.intp)
 _RIGHT_ENDS = np.array([Joint.SHOULDER_RIGHT, Joint.HIP_RIGHT], dtype=np.intp)
 

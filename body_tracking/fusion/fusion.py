@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from body_tracking.core.clocks import JUMP_BACK_NS, jumped_back
-from body_tracking.core.measurement import joint_variance, viewing_angle
+from body_tracking.core.measurement import BASE_STDDEV, COMMON_SHARE, joint_variance, viewing_angle
 from body_tracking.core.parameters import number_field
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.sides import PAIRS
@@ -377,7 +377,9 @@ class Fusion(PlacedSensors[_Sensor]):
         share = weights / np.where(known, total, 1.0)
         mean = np.einsum("kj,kji->ji", share, points)
         away = points - mean
-        claimed = np.einsum("kj,kj,kj->j", share, share, variance)
+        # what displaces a joint before all sensors alike does not average out
+        common = np.where(used, np.minimum(variance, COMMON_SHARE * BASE_STDDEV**2), 0.0)
+        claimed = np.einsum("kj,kj,kj->j", share, share, variance - common) + np.einsum("kj,kj->j", share, common)
         covariance = np.einsum("kj,kji,kjl->jil", share, away, away)
         # Add only the disagreement beyond the stated variance: along two sensors' difference the larger one results.
         spread = np.einsum("jii->j", covariance)

@@ -17,7 +17,7 @@ from two_kinects import FRAME, OFFSET, OFFSET_NS, POSES, truth
 
 from body_tracking.calibration.online import OnlineCalibration
 from body_tracking.core.clocks import ClockModel
-from body_tracking.core.measurement import left_right_axes
+from body_tracking.core.measurement import COMMON_SHARE, left_right_axes
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton
 from body_tracking.fusion.fusion import Fusion, FusionParameters
 from body_tracking.fusion.placement import FusionError
@@ -109,15 +109,28 @@ def test_two_noisy_sensors_have_smaller_error_and_covariance_than_one() -> None:
     assert np.isfinite(both).all()
     assert compared.mean() > 0.99
     assert both[compared].mean() < 0.8 * one[compared].mean()
-    for each, other in zip(alone[30:], together[30:], strict=True):
-        assert each.covariances is not None
-        assert other.covariances is not None
-        assert np.linalg.eigvalsh(other.covariances).min() > 0.0
-    assert alone[60].covariances is not None
-    assert together[60].covariances is not None
-    assert np.median(np.trace(together[60].covariances, axis1=1, axis2=2)) < np.median(
-        np.trace(alone[60].covariances, axis1=1, axis2=2)
+    traces = []
+    for made in (alone, together):
+        covariances = [each.covariances for each in made[30:] if each.covariances is not None]
+        assert len(covariances) == len(made) - 30
+        traces.append(np.nanmedian(np.trace(covariances, axis1=2, axis2=3)))
+    assert all(
+        np.linalg.eigvalsh(each.covariances).min() > 0.0 for each in together[30:] if each.covariances is not None
     )
+    assert traces[1] < 0.85 * traces[0]
+
+
+def test_what_sensors_err_by_alike_is_not_averaged_out() -> None:
+    """Two sensors that state the same variance: their mean has 3/4 of it, since half of it is common, not 1/2."""
+    seen = [replace(skeleton, covariances=np.tile(0.03**2 * np.eye(3), (25, 1, 1))) for _, skeleton, _ in frames(3.0)]
+    stated = [(name, given, now) for (name, _, now), given in zip(frames(3.0), seen, strict=True)]
+    alone = run(fusion(["kinect1"]), [each for each in stated if each[0] == "kinect1"])
+    together = run(fusion(), stated)
+    one, both = (
+        np.stack([each.covariances for each in made[30:60]])[:, Joint.ELBOW_LEFT] for made in (alone, together)
+    )
+    ratios = both.trace(axis1=1, axis2=2) / one.trace(axis1=1, axis2=2)
+    assert_allclose(ratios, 1.0 - COMMON_SHARE / 2.0, atol=0.1)
 
 
 def test_disagreement_increases_the_covariance() -> None:
