@@ -6,6 +6,7 @@ motions and seeds are those of the table in docs/accuracy.md; no filter was tune
 
   python benchmarks/every_angle.py                        30 people: about 5 minutes on two cores
   python benchmarks/every_angle.py --motions squat --convention model
+  python benchmarks/every_angle.py --sensors kinect1 --motions walking_and_turning --seeds 6   the first one alone
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 import functools
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import common
@@ -21,7 +23,7 @@ from ablation import against_truth
 from accuracy import Run
 
 from body_tracking.core.skeleton import FloatArray
-from body_tracking.evaluation.reading import read
+from body_tracking.evaluation.reading import AngleSeries, read
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.kinematics.conventions import CONVENTIONS
 from body_tracking.recording.replay import ReplaySettings, replay
@@ -36,22 +38,40 @@ Errors = dict[str, dict[str, tuple[FloatArray, FloatArray]]]
 """By filter and angle without its side: (n,) errors and (n,) stated standard deviations, radians."""
 
 
-def errors_of(convention: str, run: Run) -> Errors:
+def errors_of(convention: str, sensors: tuple[str, ...], run: Run) -> Errors:
     """The errors of one person's angles."""
     found: Errors = {}
     with tempfile.TemporaryDirectory() as folder:
         write_bag(run.recording(), Path(folder) / "in")
         for name in FILTERS:
             out = Path(folder) / name
-            replay(Path(folder) / "in", out, ReplaySettings((), filter_name=name, convention=convention))
+            replay(Path(folder) / "in", out, ReplaySettings(sensors, filter_name=name, convention=convention))
             tracked = read(out)
-            errors, stddevs = against_truth(tracked.angles, tracked.true_angles, tracked.angles.names)
+            true = canonical(tracked.true_angles)
+            errors, stddevs = against_truth(canonical(tracked.angles), true, tracked.angles.names)
             kinds = np.array([kind_of(each) for each in tracked.angles.names])
             found[name] = {
                 kind: (errors[:, kinds == kind].ravel(), stddevs[:, kinds == kind].ravel())
                 for kind in dict.fromkeys(kinds)
             }
     return found
+
+
+def canonical(angles: AngleSeries) -> AngleSeries:
+    """The angles with ISB's elevation negative throughout.
+
+    ISB's three angles of a shoulder, (plane, elevation, rotation) and (plane + pi, -elevation, rotation + pi), are one
+    pose, and each series continues its own of them through a hanging arm.
+    """
+    position = angles.position.copy()
+    for side in ("left", "right"):
+        names = [f"shoulder_{each}_{side}" for each in ("plane_of_elevation", "elevation", "internal_rotation")]
+        if set(names) <= set(angles.names):
+            plane, elevation, rotation = (angles.names.index(name) for name in names)
+            other = position[:, elevation] > 0.0
+            position[other, elevation] *= -1.0
+            position[np.ix_(other, [plane, rotation])] += np.pi
+    return replace(angles, position=position)
 
 
 def kind_of(angle: str) -> str:
@@ -75,12 +95,13 @@ def figures_of(people: list[tuple[FloatArray, FloatArray]]) -> dict[str, float]:
 
 def main() -> int:
     """The command line."""
-    parser = common.parser(__doc__, motions=list(MOTIONS), jobs=True)
+    parser = common.parser(__doc__, seeds=1, motions=list(MOTIONS), jobs=True)
     parser.add_argument("--convention", choices=list(CONVENTIONS), default="isb", help="default: %(default)s")
+    parser.add_argument("--sensors", nargs="+", default=[], metavar="NAME", help="default: both")
     args = parser.parse_args()
-    cases = [(motion, layout) for motion in args.motions for layout in LAYOUTS]
+    cases = [(motion, layout) for motion in args.motions for layout in LAYOUTS for _ in range(args.seeds)]
     runs = [Run(motion, layout, _FIRST_SEED + number) for number, (motion, layout) in enumerate(cases)]
-    people = common.mapped(functools.partial(errors_of, args.convention), runs, args.jobs)
+    people = common.mapped(functools.partial(errors_of, args.convention, tuple(args.sensors)), runs, args.jobs)
     figures = {
         name: {kind: figures_of([each[name][kind] for each in people]) for kind in people[0][name]} for name in FILTERS
     }

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import common
 import numpy as np
-from every_angle import kind_of
+from every_angle import canonical, kind_of
 from real_pairs import NOMINAL, PEOPLE
 
 from body_tracking.calibration.online import CalibrationParameters
@@ -42,29 +42,12 @@ COVERED = 0.88
 """Bar: least share of the differences within 1.96 stated deviations."""
 
 
-def canonical(angles: AngleSeries) -> FloatArray:
-    """(n, angles) radians, with ISB's elevation negative throughout.
-
-    ISB's three angles of a shoulder, (plane, elevation, rotation) and (plane + pi, -elevation, rotation + pi), are one
-    pose, and each series continues its own of them through a hanging arm.
-    """
-    position = angles.position.copy()
-    for side in ("left", "right"):
-        names = [f"shoulder_{each}_{side}" for each in ("plane_of_elevation", "elevation", "internal_rotation")]
-        if set(names) <= set(angles.names):
-            plane, elevation, rotation = (angles.names.index(name) for name in names)
-            other = position[:, elevation] > 0.0
-            position[other, elevation] *= -1.0
-            position[np.ix_(other, [plane, rotation])] += np.pi
-    return position
-
-
 def both(one: AngleSeries, two: AngleSeries, clock: ClockModel) -> dict[str, tuple[FloatArray, FloatArray]]:
     """By kind of angle the (n,) differences and their stated deviations, radians, of all frames of ``one``."""
     stamps = np.array([clock.to_reference(int(each)) for each in two.stamps_ns])
     matches = nearest(stamps, one.stamps_ns)
     here, there = np.flatnonzero(matches >= 0), matches[matches >= 0]
-    angles = canonical(one)[here], canonical(two)[there]
+    angles = canonical(one).position[here], canonical(two).position[there]
     found: dict[str, list[tuple[FloatArray, FloatArray]]] = {}
     for column, name in enumerate(one.names):
         other = two.names.index(name)

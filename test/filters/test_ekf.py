@@ -167,6 +167,27 @@ def test_joint_centre_offsets_are_in_the_published_covariance() -> None:
     assert gain.mean() > 3.3 * gain.std(ddof=1) / np.sqrt(count)
 
 
+def test_offsets_of_a_sensor_that_states_to_see_poorly_are_larger() -> None:
+    """From the side a Kinect displaces joints three times as far, which it states, and no innovation shows.
+
+    Beside another sensor that sees them well, hardly anything changes.
+    """
+    truth = random_truth(100, 1.5)
+    near = [k for k in OBSERVED if MODEL.coordinate_names[k].startswith(("shoulder", "elbow"))]
+    good = BASE_STDDEV[:, None, None] ** 2 * np.eye(3)
+    deviations = []
+    for factors in ((1.0,), (9.0,), (1.0, 1.0), (1.0, 9.0)):
+        estimator = ExtendedKalmanFilter(EkfParameters(posture=False))
+        for frame in measured(truth, 0.004).skeletons:
+            for place, factor in enumerate(factors):
+                seen = replace(frame, stamp_ns=frame.stamp_ns + place * 5_000_000, covariances=factor * good)
+                estimator.take(seen, f"sensor {place}")
+        deviations.append(np.sqrt(known(estimator).covariance.diagonal()[near]))
+    front, side, two, beside = deviations
+    assert (side > 2.0 * front).all(), side / front
+    assert (beside < 1.6 * two).all(), beside / two
+
+
 def test_contradicting_sensors_cause_no_repeated_restarts() -> None:
     """Four sensors with different constant errors of 4 cm: no pose fits them all, and a search for one is in vain."""
     rng = np.random.default_rng(3)

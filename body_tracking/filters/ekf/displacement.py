@@ -6,13 +6,15 @@ import numpy as np
 
 from body_tracking.calibration.joint_centres import JointCentres
 from body_tracking.core.measurement import joint_correlation
-from body_tracking.core.skeleton import N_JOINTS, FloatArray
+from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray
 from body_tracking.filters.ekf.kernels import displacing
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.state import State, StateSpace
 from body_tracking.kinematics.compiled_body import Linearised
 
 _DIMENSIONS = 3
+_RECENT_NS = NANOSECONDS // 5
+"""Age of a sensor's last frame up to which it counts as seeing the person."""
 
 
 class Displacement:
@@ -54,16 +56,35 @@ class Displacement:
         )
         stated = any(sensor.stated for sensor in state.sensors.values())
         scale = self._parameters.offset_scale if stated else 0.0
-        offsets = scale * np.sqrt(space.base_variance)
+        scales = scale * self._factors(state)
         if state.sources.names:
             weights = np.where(space.thumbs[state.sources.segments].any(axis=0), 0.0, weights)
         if self._centres.offsets is not None:
-            spread = scale**2 * self._remaining(state, lines)
+            of_axes = scales.repeat(_DIMENSIONS)
+            spread = of_axes * of_axes[:, None] * self._remaining(state, lines)
         else:
-            deviations = offsets.repeat(_DIMENSIONS)
+            deviations = (scales * np.sqrt(space.base_variance)).repeat(_DIMENSIONS)
             spread = self._correlation * deviations * deviations[:, None]
         gain = displacing(lines.observation, weights, self._prior_information)
         return gain @ spread @ gain.T, gain @ state.disputed
+
+    def _factors(self, state: State) -> FloatArray:
+        """(19,) factors on the deviations of the offsets, at least 1: how poorly the sensors see each point.
+
+        A sensor that sees a person from the side or from behind, or guesses a joint, displaces it farther. The mean of
+        what each of the sensors states, weighted as their points are.
+        """
+        recent = [
+            sensor
+            for sensor in state.sensors.values()
+            if sensor.stated and sensor.stamps and state.stamp_ns - sensor.stamps[-1] < _RECENT_NS
+        ]
+        if not recent:
+            return np.ones(self._space.points)
+        ratios = np.stack([sensor.stated_ratios for sensor in recent])
+        weights = 1.0 / ratios
+        mean: FloatArray = (weights * np.sqrt(ratios)).sum(axis=0) / weights.sum(axis=0)
+        return np.maximum(mean, 1.0)
 
     def _remaining(self, state: State, lines: Linearised) -> FloatArray:
         """(57, 57) square metres: covariance of the points' offsets that remain after a T-pose."""

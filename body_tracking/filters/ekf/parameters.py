@@ -30,7 +30,7 @@ class EkfParameters(OrientationParameters):
         9.0,
     )
     offset_scale: float = number_field(
-        1.2,
+        1.1,
         "distance of the joints' centres by a sensor that states covariances from the anatomical ones, in standard "
         "deviations of core/measurement.py; only a T-pose measures it, and what it leaves is added to what goes out",
         "1",

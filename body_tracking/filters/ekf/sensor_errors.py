@@ -102,6 +102,7 @@ class SensorErrors:
             4.0,
             stated,
             math.inf,
+            np.ones(space.points),
         )
 
     def seen_by(
@@ -129,7 +130,10 @@ class SensorErrors:
         if sensors.keys() - {measurement.sensor}:
             passed = max(measurement.stamp_ns - stamps[-1], 0) / NANOSECONDS if stamps else 0.0
             least = min(_stated_ratio(measurement), sensor.least_stated * math.exp(passed / _LEAST_MEMORY))
-        return sensor.but(stamps=(*stamps[-2:], measurement.stamp_ns), positions=frames, least_stated=least)
+        ratios = np.where(used, measurement.model_variance / self._space.base_variance, sensor.stated_ratios)
+        return sensor.but(
+            stamps=(*stamps[-2:], measurement.stamp_ns), positions=frames, least_stated=least, stated_ratios=ratios
+        )
 
     def _white_learnt(self, sensor: SensorState, squared: FloatArray, known: BoolArray) -> SensorState:
         """The sensor's noise with one more squared difference (19,) of the known points."""

@@ -74,6 +74,8 @@ class SensorState(Changeable):
         stated: whether its skeletons bring covariances, which include the systematic error.
         least_stated: the least that it stated lately, as a multiple of ``Measurement.base_variance``; infinity of a
             single sensor.
+        stated_ratios: (19,) what it stated of each point when this was last used, as a multiple of
+            ``StateSpace.base_variance``.
     """
 
     stamps: tuple[int, ...]
@@ -86,6 +88,7 @@ class SensorState(Changeable):
     slow_information: float
     stated: bool
     least_stated: float
+    stated_ratios: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
