@@ -139,6 +139,7 @@ def progress(text: str) -> None:
 def mapped(work: Callable[[_Job], _Result], jobs: Sequence[_Job], processes: int) -> list[_Result]:
     """The results of all jobs, in their order; prints the progress."""
     began, results = time.monotonic(), []
+    # no daemonic processes: `replay` starts a child process
     with ProcessPoolExecutor(max(1, min(processes, len(jobs))), multiprocessing.get_context("spawn")) as pool:
         for result in pool.map(work, jobs):
             results.append(result)

@@ -8,6 +8,7 @@ from body_tracking.core.sources import RecordedFrame
 from body_tracking.messages.cdr import encode_skeletons
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.offline import OfflineRunner
+from body_tracking.recording.forked import is_second
 from body_tracking.recording.replay import ReplaySettings
 from body_tracking.recording.rosbag2 import BAG_WIRE
 
@@ -27,22 +28,32 @@ class OfflineGraph:
     def __init__(
         self, settings: ReplaySettings, sink: Callable[[str, bytes, int], None], topics: Iterable[str]
     ) -> None:
-        self.stages = {each.node: each.make() for each in settings.stages()}
+        hosted = settings.stages()
+        self.stages = {each.node: each.make() for each in hosted}
         self._sink = sink
-        self._runner = OfflineRunner([*self.stages.values()], BAG_WIRE, sink, topics)
+        upstream = [self.stages[each.node] for each in hosted if not is_second(each.executable)]
+        downstream = [self.stages[each.node] for each in hosted if is_second(each.executable)]
+        published = {*topics, *(port.topic for stage in upstream for port in stage.outputs)}
+        self._upstream = OfflineRunner(upstream, BAG_WIRE, self._pass)
+        self._downstream = OfflineRunner(downstream, BAG_WIRE, sink, published)
+
+    def _pass(self, topic: str, cdr: bytes, at_ns: int) -> None:
+        self._sink(topic, cdr, at_ns)
+        self._downstream.push(topic, cdr, at_ns)
 
     def start(self, at_ns: int) -> None:
-        """Start the stages, before the first message."""
-        self._runner.start(at_ns)
+        """Start the calibration and fusion, before the first message."""
+        self._upstream.start(at_ns)
 
     def push(self, topic: str, cdr: bytes, at_ns: int) -> None:
         """Pass on one message of a sensor."""
-        self._sink(topic, cdr, at_ns)
-        self._runner.push(topic, cdr, at_ns)
+        self._pass(topic, cdr, at_ns)
+        self._upstream.push(topic, cdr, at_ns)
 
     def finish(self, at_ns: int) -> None:
         """Finish all stages, after the last message."""
-        self._runner.finish(at_ns)
+        self._upstream.finish(at_ns)
+        self._downstream.finish(at_ns)
 
     def play(self, frames: Sequence[RecordedFrame]) -> None:
         """Pass on all frames of the sensors, in the order of receipt, from start to finish."""

@@ -31,12 +31,12 @@ from body_tracking.pipeline import graph
 from body_tracking.pipeline.offline import OfflineRunner
 from body_tracking.pipeline.people import SubjectSelector
 from body_tracking.pipeline.roles import ROLES
-from body_tracking.pipeline.stage import Stage
 from body_tracking.pipeline.system import Options
+from body_tracking.recording import forked
 from body_tracking.recording.finding import advice_for, unused
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rig import RigReader
-from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, BagWriter, check_new_bag, deserialize
+from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, check_new_bag, deserialize
 from body_tracking.recording.summary import summary
 from body_tracking.systems import (
     OPTIONS,
@@ -58,25 +58,6 @@ class ReplayError(BodyTrackingError):
 
 OFFLINE: Final[Mapping[str, Value]] = {"deadline": 1.0}
 """Time limits of the stages, seconds: with those of a live graph, offline results would depend on the machine."""
-
-
-@dataclass(frozen=True, slots=True)
-class StageSettings:
-    """A stage of the graph.
-
-    Attributes:
-        node: name of the node that would host it.
-        executable: of that node.
-        values: of all its parameters.
-    """
-
-    node: str
-    executable: str
-    values: Mapping[str, Value]
-
-    def make(self) -> Stage:
-        """The stage; BodyTrackingError for invalid parameters."""
-        return stage_class(self.executable)(self.values)
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +106,7 @@ class ReplaySettings:
         """Whether the graph has sensors beside those of the option ``sensors``."""
         return bool(self.imus) or any(OPTIONS[name].source and bool(value) for name, value in self.more.items())
 
-    def stages(self) -> tuple[StageSettings, ...]:
+    def stages(self) -> tuple[forked.StageSettings, ...]:
         """The stages with all their parameters, in the order in which messages go through them.
 
         Raises:
@@ -139,7 +120,7 @@ class ReplaySettings:
             values = {**own, **check_all(table, {key: value for key, value in given.items() if key in known})}
             if self.smooth and spec.executable == "skeleton_filter":
                 values["lag"] = WHOLE_LAG
-            found.append(StageSettings(spec.name, spec.executable, values))
+            found.append(forked.StageSettings(spec.name, spec.executable, values))
         return tuple(found)
 
 
@@ -259,28 +240,20 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
         if settings.calibration_file is not None:
             lack = lacking(load(settings.calibration_file), settings.sensors)  # raises if it is missing or invalid
             notes = [f"{settings.calibration_file}{lack}"] if lack else []
-        chosen = settings.stages()
-        stages = {each.node: each.make() for each in chosen}  # they may raise: before `out` is replaced
-        progress = Progress(bag.start_ns, bag.end_ns)
-        published: Counter[str] = Counter()
-        recorded_filters: dict[str, None] = {}
-        writer = BagWriter(out, overwrite=overwrite)
-
-        def written(topic: str) -> bool:
-            return settings.model_covariance or not graph.is_model_covariance(topic)
-
-        def publish(topic: str, cdr: bytes, at_ns: int) -> None:
-            published[topic] += 1
-            if written(topic):
-                writer.write(topic, cdr, at_ns)
-
+        all_stages = settings.stages()
+        # the stages may raise: construct them before `out` is replaced
+        first = {each.node: each.make() for each in all_stages if not forked.is_second(each.executable)}
+        stages = [*first.values()]
+        written_by_us = {
+            p.topic: (p.codec.type_name, p.qos) for stage in stages for p in stage.outputs if not p.optional
+        }
+        job = forked.Job(all_stages, out, {**passed, **written_by_us}, overwrite, settings.model_covariance)
+        downstream = forked.start_downstream(job)
         try:
-            runner = OfflineRunner([*stages.values()], BAG_WIRE, publish, kept)
-            own = {p.topic: (p.codec.type_name, p.qos) for p in runner.outputs if not p.optional}
-            for topic, (type_name, qos) in {**passed, **own}.items():
-                if written(topic):
-                    writer.add_topic(topic, type_name, qos)
+            runner = OfflineRunner(stages, BAG_WIRE, downstream.take)
+            progress = Progress(bag.start_ns, bag.end_ns)
             started = False
+            recorded_filters: dict[str, None] = {}
             for raw in bag.messages((*kept, graph.DIAGNOSTICS_TOPIC)):
                 if raw.topic == graph.DIAGNOSTICS_TOPIC:
                     recorded_filters.update(dict.fromkeys(_filters_in(raw.cdr)))
@@ -288,29 +261,28 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
                 if not started and raw.topic in (topics or sources):
                     started = True
                     runner.start(raw.log_time_ns)
-                writer.write(raw.topic, raw.cdr, raw.log_time_ns)
+                downstream.take(raw.topic, raw.cdr, raw.log_time_ns)
                 runner.push(raw.topic, raw.cdr, raw.log_time_ns)
                 progress.at(raw.log_time_ns)
             runner.finish(bag.end_ns)
-            progress.end()
-            counters = Counter(runner.counters)
-            for node, stage in stages.items():
-                name = "filter" if node == "skeleton_filter" else node
-                counters.update({f"{name} {event}": count for event, count in stage.counters.items()})
-            states = {node: stage.state(bag.end_ns) for node, stage in stages.items()}
-            problems = [f"{node}: {text}" for node, (level, text, _) in states.items() if level and text]
-            frames = sum(count for topic, count in published.items() if topic.endswith("/joint_states"))
-            if not frames:
-                given = ", ".join(settings.sensors or sources)
-                said = "; ".join(problems) or _listed(+counters)
-                raise ReplayError(f"{bag_path}: no frame of {given} came through ({said})")
-            writer.close()
+            written = downstream.finish(bag.end_ns)
         except BaseException:
-            writer.discard()
+            downstream.abandon()
             raise
+        progress.end()
+        counters = Counter(runner.counters)
+        for node, stage in first.items():
+            counters.update({f"{node} {name}": count for name, count in stage.counters.items()})
+        counters |= Counter(written.counters)  # both halves may have counted the same message
+        states = {node: stage.state(bag.end_ns) for node, stage in first.items()}
+        problems = [f"{node}: {text}" for node, (level, text, _) in states.items() if level and text]
+        if not written.frames:
+            given = ", ".join(settings.sensors or sources)
+            said = "; ".join(problems) or _listed(+counters)
+            raise ReplayError(f"{bag_path}: no frame of {given} came through ({said})")
         return ReplayReport(
-            frames,
-            next((str(each.values["filter"]) for each in chosen if each.executable == "skeleton_filter"), ""),
+            written.frames,
+            next((str(each.values["filter"]) for each in all_stages if each.executable == "skeleton_filter"), ""),
             tuple(recorded_filters),
             (bag.end_ns - bag.start_ns) / NANOSECONDS,
             time.perf_counter() - began,

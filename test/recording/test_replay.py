@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import json
+import multiprocessing
+import os
 import re
 import shutil
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from body_tracking import cli
@@ -31,6 +39,8 @@ from body_tracking.messages.diagnostics import diagnostics
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.offline import OfflineRunner
+from body_tracking.recording import forked
+from body_tracking.recording.forked import Downstream, ForkedDownstream
 from body_tracking.recording.importer import import_files
 from body_tracking.recording.replay import ReplayError, ReplaySettings, replay
 from body_tracking.recording.rig import RigReader
@@ -40,6 +50,7 @@ from body_tracking.simulation.bags import write_bag
 from body_tracking.simulation.scene import Setup, simulate
 from draws import some
 from excerpts import beginning
+from patience import PATIENCE
 from pose_networks import MISSING, REASON
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -101,9 +112,69 @@ def test_deviations_are_finite_where_something_is_known(replayed_wave: Path) -> 
     assert finite.any(axis=0).all() and not finite.all()
 
 
-def test_a_replay_gives_the_same_messages_each_time(replayed_wave: Path, wave: Path, tmp_path: Path) -> None:
-    replay(wave, tmp_path / "out", ReplaySettings())
-    assert contents(tmp_path / "out") == contents(replayed_wave)
+@pytest.mark.parametrize("filter_name", some([DEFAULT_FILTER, "ekf"]))
+def test_one_process_and_several_give_the_same_messages_each_time(
+    replayed_wave: Path, wave: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, filter_name: str
+) -> None:
+    settings = ReplaySettings(filter_name=filter_name)
+    reports = {}
+    for stage in (Downstream, ForkedDownstream):
+        monkeypatch.setattr(forked, "start_downstream", stage)
+        reports[stage] = replay(wave, tmp_path / stage.__name__, settings)
+    assert contents(tmp_path / "Downstream") == contents(tmp_path / "ForkedDownstream")
+    assert reports[Downstream].counters == reports[ForkedDownstream].counters
+    if filter_name == DEFAULT_FILTER:
+        assert contents(tmp_path / "Downstream") == contents(replayed_wave)
+
+
+class Owner:
+    """An object in a reference cycle, as ROS nodes are; records the process that destroys it."""
+
+    def __init__(self, notes: Path) -> None:
+        self._notes, self._own = notes, self
+
+    def __del__(self) -> None:
+        with self._notes.open("a") as file:
+            file.write(f"{os.getpid()}\n")
+
+
+def test_the_other_process_does_not_collect_inherited_garbage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Collecting(Downstream):
+        def finish(self, at_ns: int) -> forked.Written:
+            gc.collect()
+            return super().finish(at_ns)
+
+    monkeypatch.setattr(forked, "Downstream", Collecting)
+    notes = tmp_path / "notes"
+    thresholds = gc.get_threshold()
+    gc.set_threshold(10**9)  # the garbage is still there at the fork
+    try:
+        Owner(notes)
+        ForkedDownstream(job(tmp_path / "out")).finish(0)
+    finally:
+        gc.set_threshold(*thresholds)
+    assert gc.isenabled()
+    gc.collect()
+    assert notes.read_text() == f"{os.getpid()}\n"
+
+
+def job(out: Path, **settings: str) -> forked.Job:
+    chosen = ReplaySettings(("kinect1",), **settings)  # type: ignore[arg-type]
+    return forked.Job(chosen.stages(), out, {}, overwrite=False, model_covariance=False)
+
+
+def test_the_end_of_the_other_process_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Ending(Downstream):
+        def take(self, topic: str, cdr: bytes, log_time_ns: int) -> None:
+            time.sleep(0.2)  # until more messages have come, which stay unread
+            os._exit(7)
+
+    monkeypatch.setattr(forked, "Downstream", Ending)
+    stage = ForkedDownstream(job(tmp_path / "out"))
+    for _ in range(300):
+        stage.take(graph.FUSED, b"", 0)
+    with pytest.raises(BagError, match="ended with code 7"):
+        stage.finish(0)
 
 
 MODEL_TOPICS = (graph.MODEL_STATE, graph.MODEL_STATE_STDDEV, graph.segments_topic("body1"))
@@ -424,6 +495,21 @@ def test_a_bag_without_skeletons_is_named_in_one_line(
     assert not (tmp_path / "out").exists()
 
 
+def test_a_failure_of_the_second_half_is_reported_and_leaves_no_bag(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for stage in (Downstream, ForkedDownstream):
+        with pytest.raises(BagError):
+            stage(job(tmp_path / "file" / "out"))
+        with pytest.raises(BodyTrackingError, match="no_such_filter"):
+            stage(job(tmp_path / "out", filter_name="no_such_filter"))
+    broken = ForkedDownstream(job(tmp_path / "out"))
+    with pytest.raises(BagError):
+        for _ in range(1000):
+            broken.take("/nobody", b"", 0)
+        broken.finish(0)
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -431,7 +517,7 @@ def test_a_bag_without_skeletons_is_named_in_one_line(
         (("--calibration", "absent.yaml"), "absent.yaml"),
     ],
 )
-def test_an_error_of_a_stage_leaves_no_bag(
+def test_an_error_of_the_first_stage_ends_both_processes_and_leaves_no_bag(
     tmp_path: Path, command: Command, arguments: tuple[str, str], message: str
 ) -> None:
     code, _, error = command("replay", BAG, "-o", tmp_path / "out", *arguments)
@@ -441,21 +527,52 @@ def test_an_error_of_a_stage_leaves_no_bag(
     assert not (tmp_path / "out").exists()
 
 
-def test_an_error_of_a_stage_leaves_the_bag_that_was_to_be_replaced(tmp_path: Path, replayed_wave: Path) -> None:
+def test_an_error_of_the_first_stage_leaves_the_bag_that_was_to_be_replaced(
+    tmp_path: Path, replayed_wave: Path
+) -> None:
     shutil.copytree(replayed_wave, tmp_path / "out")
     with pytest.raises(BodyTrackingError, match="kinect9"):
         replay(BAG, tmp_path / "out", ReplaySettings(reference="kinect9"), overwrite=True)
     assert contents(tmp_path / "out") == contents(replayed_wave)
 
 
-def test_an_error_while_frames_come_leaves_no_bag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_while_frames_come_ends_both_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(self: object, *frame: object) -> None:
         raise ReplayError("no more")
 
+    monkeypatch.setattr(forked, "start_downstream", ForkedDownstream)
     monkeypatch.setattr(OfflineRunner, "push", fail)
     with pytest.raises(ReplayError, match="no more"):
         replay(BAG, tmp_path / "out", ReplaySettings())
     assert not (tmp_path / "out").exists()
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.parametrize("victim", some(["reader", "writer", "filter"], 2))
+def test_where_one_process_is_killed_the_others_end_and_leave_no_bag(tmp_path: Path, victim: str) -> None:
+    out = tmp_path / "out"
+    arguments = [sys.executable, "-m", "body_tracking.cli", "replay", str(BAG), "-o", str(out)]
+    reader = psutil.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    others: list[psutil.Process] = []
+    deadline = time.monotonic() + PATIENCE
+    try:
+        while not out.exists() or len(others) < 2:
+            assert time.monotonic() < deadline
+            others = reader.children(recursive=True)
+            time.sleep(0.01)
+        {"reader": reader, "filter": others[0], "writer": others[1]}[victim].kill()
+        _, reported = reader.communicate(timeout=PATIENCE)
+        while out.exists():
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+    finally:
+        for process in (*others, reader):
+            with contextlib.suppress(psutil.NoSuchProcess):
+                process.kill()
+    assert not psutil.wait_procs(others, timeout=PATIENCE)[1]
+    if victim != "reader":
+        assert reader.returncode == 2, reported.decode()
+        assert reported.count(b"\n") == 1
 
 
 def test_parameters_are_checked_before_anything_runs(tmp_path: Path, command: Command) -> None:
