@@ -34,7 +34,7 @@ export MPLBACKEND := Agg
 export PYTHONUNBUFFERED := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo demo-markers demo-mesh demo-camera demo-imus test test-all lint ros2-workspace bench docs site clean
+.PHONY: help setup demo demo-markers demo-mesh demo-camera demo-imus test test-all test-ros2 lint ros2-workspace bench docs site clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z0-9-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 16
@@ -102,6 +102,10 @@ test: $(STAMP) ## formatting, lint, types and the tests, in five minutes
 test-all: export TEST_DRAWS = all
 test-all: $(STAMP) $(SITE_VENV)/.installed ## the same with the longer draws and recordings, in half an hour
 	@$(call tests,slow or not slow)
+
+test-ros2: export TEST_DRAWS = all
+test-ros2: $(STAMP) ros2-workspace ## all that runs the real ros2, as CI does after `make test`: every node, ten Ctrl-Cs
+	$(BIN)/python -m pytest -m "(slow or not slow) and ros2" --numprocesses 4 --dist loadscope --no-loadscope-reorder test/ros2
 
 define tests
 failed=; phase() { name="$$1"; shift; echo "== $$name"; $(BIN)/python -m pytest "$$@" || failed="$$failed, $$name"; }; \

@@ -37,19 +37,19 @@ QUIET = 2.0
 """Seconds of compiling after which the user reads why the program waits."""
 
 
-class CompilingNotice(event.TimingListener):
+class CompilingNotice(event.TimingListener):  # type: ignore[misc]
     """Prints one line to stderr where a process compiles for long; loading from the cache prints nothing."""
 
     def on_end(self, event: Any) -> None:
         """A loop has been compiled; ``duration`` grows where it is not part of another one."""
         before = self.duration if self.done else 0.0
-        super().on_end(event)  # type: ignore[no-untyped-call]
+        super().on_end(event)
         if self.done and before <= QUIET < self.duration:
             print("compiling loops, once for each version: this may take a minute", file=sys.stderr, flush=True)
 
 
-NOTICE = CompilingNotice()  # type: ignore[no-untyped-call]
-event.register("numba:compile", NOTICE)  # type: ignore[no-untyped-call]
+NOTICE = CompilingNotice()
+event.register("numba:compile", NOTICE)
 
 
 def compiled(function: _Function) -> _Function:
@@ -69,7 +69,7 @@ def compiled(function: _Function) -> _Function:
     return cast("_Function", loop)
 
 
-class ByContent(UserWideCacheLocator):
+class ByContent(UserWideCacheLocator):  # type: ignore[misc]
     """Locator of machine code in a folder whose name holds the digest of the source and of its imports.
 
     numba's own locators check only the function's own file: after a change of an imported function or constant they
@@ -79,7 +79,7 @@ class ByContent(UserWideCacheLocator):
 
     def __init__(self, function: Any, path: str) -> None:
         """For one function, in the file of this path."""
-        super().__init__(function, path)  # type: ignore[no-untyped-call]
+        super().__init__(function, path)
         self._digest = digest(function, path)
         self._cache_path = str(user_cache() / "compiled" / f"{function.__module__}-{self._digest[:16]}")
 
@@ -93,7 +93,7 @@ class ByContent(UserWideCacheLocator):
         if not folder.exists():
             module = folder.name.rpartition("-")[0]
             _remove_oldest(folder.parent.glob(f"{module}-*"))
-        super().ensure_cache_path()  # type: ignore[no-untyped-call]
+        super().ensure_cache_path()
 
     def get_source_stamp(self) -> str:
         """Digest of the source and of its imports."""
