@@ -183,6 +183,9 @@ def test_offsets_of_a_sensor_that_states_to_see_poorly_are_larger() -> None:
                 seen = replace(frame, stamp_ns=frame.stamp_ns + place * 5_000_000, covariances=factor * good)
                 estimator.take(seen, f"sensor {place}")
         deviations.append(np.sqrt(known(estimator).covariance.diagonal()[near]))
+        later = estimator.predict(known(estimator).stamp_ns + NANOSECONDS // 2)
+        assert later is not None  # what nobody sees is known no better
+        assert (np.sqrt(later[1].covariance.diagonal()[near]) > 0.99 * deviations[-1]).all()
     front, side, two, beside = deviations
     assert (side > 2.0 * front).all(), side / front
     assert (beside < 1.6 * two).all(), beside / two

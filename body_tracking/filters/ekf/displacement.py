@@ -14,7 +14,7 @@ from body_tracking.kinematics.compiled_body import Linearised
 
 _DIMENSIONS = 3
 _RECENT_NS = NANOSECONDS // 5
-"""Age of a sensor's last frame up to which it counts as seeing the person."""
+"""Time before the newest frame in which a sensor's last one must lie for it to count as seeing the person."""
 
 
 class Displacement:
@@ -74,13 +74,11 @@ class Displacement:
         A sensor that sees a person from the side or from behind, or guesses a joint, displaces it farther. The mean of
         what each of the sensors states, weighted as their points are.
         """
-        recent = [
-            sensor
-            for sensor in state.sensors.values()
-            if sensor.stated and sensor.stamps and state.stamp_ns - sensor.stamps[-1] < _RECENT_NS
-        ]
-        if not recent:
+        last = {name: sensor.stamps[-1] for name, sensor in state.sensors.items() if sensor.stated and sensor.stamps}
+        if not last:
             return np.ones(self._space.points)
+        newest = max(last.values())
+        recent = [state.sensors[name] for name, stamp_ns in last.items() if newest - stamp_ns < _RECENT_NS]
         ratios = np.stack([sensor.stated_ratios for sensor in recent])
         weights = 1.0 / ratios
         mean: FloatArray = (weights * np.sqrt(ratios)).sum(axis=0) / weights.sum(axis=0)
