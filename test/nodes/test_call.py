@@ -59,23 +59,23 @@ def rigs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rigs]:
 
 
 def test_services_are_listed_with_what_they_do(rigs: Rigs) -> None:
-    for _ in range(5):  # on a busy machine a node may be discovered only after the others' list has settled
-        code, printed, error = rigs.say()
-        listed = dict(line.split(maxsplit=1) for line in printed.splitlines())
+    """A node may be discovered only after the others' list has settled: the list is asked for until all are in it."""
+
+    def listed(*words: str) -> dict[str, str]:
+        code, printed, error = rigs.say(*words)
         assert code == 0 and not error
-        if {"calibration/start", "lab/calibration/start", "recorder/stop", "side_mesh/personalise"} <= listed.keys():
-            break
-    assert listed["calibration/start"].startswith("estimate the poses anew")
-    assert listed["lab/calibration/start"] == listed["calibration/start"]
-    assert listed["recorder/stop"] == "stop recording and close the bag"
-    assert graph.ALIGN_SERVICE not in listed, "no node offers it"
-    assert listed["side_mesh/personalise"].startswith("estimate the shape")
-    for _ in range(5):
-        code, printed, error = rigs.say("--namespace", "lab")
-        names = [line.split()[0] for line in printed.splitlines()]
-        if len(names) >= 2:
-            break
-    assert names == ["calibration/reset", "calibration/start"]
+        return dict(line.split(maxsplit=1) for line in printed.splitlines())
+
+    wanted = {"calibration/start", "lab/calibration/start", "recorder/stop", "side_mesh/personalise"}
+    lists: list[dict[str, str]] = []
+    assert rigs.until(lambda: lists.append(listed()) or wanted <= lists[-1].keys())
+    services = lists[-1]
+    assert services["calibration/start"].startswith("estimate the poses anew")
+    assert services["lab/calibration/start"] == services["calibration/start"]
+    assert services["recorder/stop"] == "stop recording and close the bag"
+    assert graph.ALIGN_SERVICE not in services, "no node offers it"
+    assert services["side_mesh/personalise"].startswith("estimate the shape")
+    assert rigs.until(lambda: list(listed("--namespace", "lab")) == ["calibration/reset", "calibration/start"])
 
 
 @pytest.mark.parametrize("words", [["/calibration/start"], ["--namespace", "/lab", "calibration/start"]])
