@@ -22,6 +22,7 @@ from body_tracking.core.parameters import Value, check_all
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.markers import setup
 from body_tracking.markers.boards import Chessboard
+from body_tracking.markers.calibration_report import table
 from body_tracking.markers.camera_calibration import calibrate_cameras, find_boards
 from body_tracking.markers.chain import ChainFit, JointDescription, fit_chain
 from body_tracking.markers.chain_files import load_chain, save_chain, to_urdf
@@ -186,12 +187,7 @@ def calibrate(args: argparse.Namespace) -> int:
         },
         "left_out": [f"view {each.view}, {each.camera or 'all cameras'}: {each.reason}" for each in found.rejected],
     }
-    lines = [
-        f"{name}: RMS {rms[k]:.3f} px (of the distance, as OpenCV has it; {axes[k, 0]:.3f} in x, {axes[k, 1]:.3f} in y)"
-        for k, name in enumerate(names)
-    ]
-    lines += [f"left out: {line}" for line in report["left_out"]]
-    return _say(args, report, [*lines, f"written to {report['rig']}"])
+    return _say(args, report, [*table(found).splitlines(), f"written to {report['rig']}"])
 
 
 def target(args: argparse.Namespace) -> int:
