@@ -26,6 +26,8 @@ _CONVERGED: Final = 1e-10
 """Relative change of the cost at which the iteration ends."""
 _DAMPING: Final = 1e-4
 _MAX_DAMPING: Final = 1e10
+_RADIAL: Final = 2
+"""The first coefficients of a camera's distortion are k1 and k2."""
 
 State = TypeVar("State")
 
@@ -274,20 +276,18 @@ def adjust(rig: Rig, rotations: FloatArray, translations: FloatArray, corners: C
     )
 
 
-def free_parameters(rig: Rig, coefficients: tuple[int, ...] | None) -> BoolArray:
+def free_parameters(rig: Rig, *, lenses: bool) -> BoolArray:
     """(p,) which parameters of a rig an adjustment fits.
 
     Args:
         rig: the rig; the pose of its first camera defines the rig's frame and stays fixed.
-        coefficients: free distortion coefficients, beside the camera's matrix: (0, 1) for the radial ones of Gaschler's
-            eq. 4.7; None for fixed lenses.
+        lenses: whether the cameras' matrices and the radial distortion k1, k2 (Gaschler 2011, eq. 4.7) are fitted.
     """
     free = np.zeros(rig.size, dtype=np.bool_)
     for index, start in enumerate(projection.offsets(rig)[:-1]):
         camera = rig.cameras[index]
-        if coefficients is not None:
-            free[start : start + LENS] = True
-            free[start + LENS + np.array(coefficients, dtype=np.intp)] = True
+        if lenses:
+            free[start : start + LENS + _RADIAL] = True
         if index > 0:
             free[start + LENS + len(camera.distortion) : start + projection.size(camera)] = True
     return free

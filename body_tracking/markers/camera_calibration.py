@@ -23,9 +23,6 @@ from body_tracking.markers.boards import CharucoBoard, Chessboard, Image
 from body_tracking.markers.bundle import Adjusted, Corners
 from body_tracking.markers.rig import Rig
 
-RADIAL: Final = (0, 1)
-"""Coefficients k1 and k2 of the distortion, Gaschler's eq. 4.7."""
-
 MIN_CORNERS: Final = 6
 """Least number of a board's corners in an image: four determine its pose, without redundancy to check it."""
 MIN_BOARDS: Final = 3
@@ -39,7 +36,6 @@ _ACROSS: Final = (5.0, 3.0)
 """Bound of the distance between a board and its prediction from another camera, median over corners; same form."""
 _ADJUSTED: Final = (2.0, 0.1)
 """Bound of a board's RMS in the bundle adjustment; same form."""
-_NO_FIT: Final = "its corners do not fit the camera"
 _CV: Any = cv2
 
 
@@ -137,7 +133,6 @@ def calibrate_cameras(
     frames: Sequence[str],
     sizes: Sequence[tuple[int, int]],
     corners: Corners,
-    coefficients: tuple[int, ...] = RADIAL,
 ) -> CameraCalibration:
     """Calibrate one camera or more, and their poses to each other.
 
@@ -147,7 +142,6 @@ def calibrate_cameras(
         frames: of the cameras; the first one is the rig's frame.
         sizes: width and height of each camera's images, pixels.
         corners: of a flat board (z = 0), seen at instants common to the cameras.
-        coefficients: distortion coefficients to fit, :data:`RADIAL` or more; the others are zero.
 
     Raises:
         CalibrationError: a camera sees too few good boards or shares none with the others, or a pixel is not finite.
@@ -162,29 +156,11 @@ def calibrate_cameras(
         camera, boards = _single_camera(frame, size, index, corners, rejected)
         cameras.append(camera)
         seen.append(boards)
-    return _set_of_cameras(cameras, seen, corners, coefficients, rejected)
-
-
-def calibrate_poses(cameras: Sequence[Camera], corners: Corners) -> CameraCalibration:
-    """Calibrate the relative poses of cameras with known lenses.
-
-    Args:
-        cameras: two or more; the first one's frame is the rig's.
-        corners: of a flat board (z = 0), seen at instants common to the cameras.
-
-    Raises:
-        CalibrationError: a camera sees too few good boards or shares none with the others, or a pixel is not finite.
-    """
-    _check(corners, len(cameras))
-    rejected: list[Rejected] = []
-    seen: list[dict[int, _Seen]] = []
-    for index, camera in enumerate(cameras):
-        boards = _planar_boards(camera.frame_id, index, corners, rejected)
-        seen.append({view: _board_pose(camera, rows, corners) for view, rows in boards.items()})
-        errors = np.array([_rms(_missed(camera, each, each, corners)) for each in seen[-1].values()])
-        kept = _without(boards, _too_large(errors, _SINGLE), camera.frame_id, errors, _NO_FIT, rejected)
-        seen[-1] = {view: board for view, board in seen[-1].items() if view in kept}
-    return _set_of_cameras(list(cameras), seen, corners, None, rejected)
+    rotations, translations = _camera_poses(cameras, seen, corners)
+    count = sum(projection.size(camera) for camera in cameras)
+    placed = Rig(tuple(cameras), rotations, translations, np.zeros((count, count)))
+    _reject_contradictions(placed, seen, corners, rejected)
+    return _adjusted(placed, seen, corners, rejected)
 
 
 def _check(corners: Corners, cameras: int) -> None:
@@ -192,20 +168,6 @@ def _check(corners: Corners, cameras: int) -> None:
         raise CalibrationError("a corner is not finite, or the board not flat (z = 0 in its own frame)")
     if len(corners) and not 0 <= corners.cameras.min() <= corners.cameras.max() < cameras:
         raise CalibrationError(f"corners in camera {corners.cameras.max()} of {cameras} cameras")
-
-
-def _set_of_cameras(
-    cameras: list[Camera],
-    seen: list[dict[int, _Seen]],
-    corners: Corners,
-    coefficients: tuple[int, ...] | None,
-    rejected: list[Rejected],
-) -> CameraCalibration:
-    rotations, translations = _camera_poses(cameras, seen, corners)
-    size = sum(projection.size(camera) for camera in cameras)
-    placed = Rig(tuple(cameras), rotations, translations, np.zeros((size, size)))
-    _reject_contradictions(placed, seen, corners, rejected)
-    return _adjusted(placed, seen, corners, coefficients, rejected)
 
 
 def _too_large(values: FloatArray, bound: tuple[float, float]) -> BoolArray:
@@ -238,20 +200,6 @@ def _planar_boards(frame: str, index: int, corners: Corners, rejected: list[Reje
     return _without(boards, _too_large(errors, _PLANE), frame, errors, "its corners are not of a plane", rejected)
 
 
-def _board_pose(camera: Camera, rows: IntArray, corners: Corners) -> _Seen:
-    """Pose of a board in a camera with a known lens."""
-    flat = camera.undistort(corners.pixels[rows])
-    if not np.isfinite(flat).all():
-        raise CalibrationError(f"camera {camera.frame_id}: a corner where its distortion gives no direction")
-    try:
-        found, turn, shift = _CV.solvePnP(corners.board[rows], flat, np.eye(3), None)
-    except cv2.error as error:
-        raise CalibrationError(f"camera {camera.frame_id}: OpenCV finds no pose of a board ({error.err})") from error
-    if not found:
-        raise CalibrationError(f"camera {camera.frame_id}: OpenCV finds no pose of a board")
-    return _Seen(rows, np.asarray(_CV.Rodrigues(turn)[0]), np.asarray(shift).ravel())
-
-
 def _single_camera(
     frame: str, size: tuple[int, int], index: int, corners: Corners, rejected: list[Rejected]
 ) -> tuple[Camera, dict[int, _Seen]]:
@@ -280,7 +228,7 @@ def _single_camera(
         wrong = _too_large(errors, _SINGLE) & (errors == errors.max())
         if not wrong.any():
             return camera, found
-        boards = _without(boards, wrong, frame, errors, _NO_FIT, rejected)
+        boards = _without(boards, wrong, frame, errors, "its corners do not fit the camera", rejected)
 
 
 def _check_count(frame: str, boards: dict[int, IntArray]) -> None:
@@ -390,7 +338,6 @@ def _adjusted(
     rig: Rig,
     seen: list[dict[int, _Seen]],
     corners: Corners,
-    coefficients: tuple[int, ...] | None,
     rejected: list[Rejected],
 ) -> CameraCalibration:
     """Bundle adjustment; rejects the board with the largest residuals until none exceeds the bound."""
@@ -400,7 +347,7 @@ def _adjusted(
         for view, board in seen[index].items():
             turns[view] = rig.rotations[index].T @ board.rotation
             shifts[view] = rig.rotations[index].T @ (board.translation - rig.translations[index])
-    free = bundle.free_parameters(rig, coefficients)
+    free = bundle.free_parameters(rig, lenses=True)
     while True:
         for index, camera in enumerate(rig.cameras):
             _check_count(camera.frame_id, {view: board.rows for view, board in seen[index].items()})

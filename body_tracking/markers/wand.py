@@ -166,7 +166,7 @@ def calibrate_wand(
     size = sum(projection.size(camera) for camera in cameras)
     known = np.zeros((size, size)) if covariance is None else covariance
     rig = Rig(tuple(cameras), rotations, translations, known)
-    prior, poses = Prior.of(rig), bundle.free_parameters(rig, None)
+    prior, poses = Prior.of(rig), bundle.free_parameters(rig, lenses=False)
     used: BoolArray = np.asarray(np.isfinite(flat).all(axis=-1))
     errors = _pixels(rig, seen, intersect(rig, seen.where(used), len(wand.places), flat[used])) - seen.pixels
     used &= _inliers(np.linalg.norm(errors, axis=-1), used)
@@ -227,12 +227,14 @@ def intersect(rig: Rig, seen: Sightings, points: int, flat: FloatArray | None = 
         rig: the cameras.
         seen: (m) sightings.
         points: number of points of the object.
-        flat: (m, 2) undistorted image coordinates, if known already.
+        flat: (m, 2) undistorted image coordinates, if known already. Pixels without any give no ray.
 
     Returns:
         (v, points, 3) metres; zeros for a point with fewer than two rays.
     """
     flat = _flat(rig.cameras, seen) if flat is None else flat
+    directed = np.asarray(np.isfinite(flat).all(axis=-1))
+    seen, flat = seen.where(directed), flat[directed]
     rays = np.concatenate([flat, np.ones_like(flat[:, :1])], axis=-1)
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     turns = rig.rotations[seen.cameras].transpose(0, 2, 1)

@@ -11,7 +11,7 @@ from rigs import rig
 from body_tracking.core import so3
 from body_tracking.markers.bundle_points import Sightings
 from body_tracking.markers.rig import Rig
-from body_tracking.markers.wand import Wand, WandError, calibrate_wand
+from body_tracking.markers.wand import Wand, WandError, calibrate_wand, intersect
 from draws import draws
 
 WAND = Wand((0.0, 0.15, 0.45))
@@ -78,6 +78,20 @@ def test_errors_of_the_lenses_are_in_the_deviations_of_the_poses() -> None:
         assert (deviation[:, :4] < LENS[:4]).all()
     # 1 is expected; with fixed lenses it would be 10
     assert np.sqrt(np.mean(np.square(standard))) < 2.0
+
+
+def test_a_pixel_without_a_direction_places_no_point() -> None:
+    truth = rig(2)
+    # barrel distortion reaches its largest radius within the image: beyond it no direction leads to a pixel
+    bent = replace(truth.cameras[0], distortion=np.array([-1.2, 0.0, 0.0, 0.0, 0.0]))
+    truth = replace(truth, cameras=(bent, truth.cameras[1]))
+    places = np.array([[0.0, 0.0, 1.0], [0.05, 0.05, 1.1]])
+    pixels = truth.project(places)
+    pixels[0, 1] = [0.0, 0.0]
+    assert not np.isfinite(bent.undistort(pixels[0, 1:])).any()
+    seen = Sightings(np.array([0, 0, 1, 1]), np.zeros(4, dtype=np.intp), np.array([0, 1, 0, 1]), pixels.reshape(4, 2))
+    points = intersect(truth, seen, 2)
+    np.testing.assert_allclose(points[0], [places[0], np.zeros(3)], atol=1e-9)
 
 
 def test_a_wand_is_found_among_other_balls_or_not_at_all() -> None:
