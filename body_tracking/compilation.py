@@ -1,4 +1,4 @@
-"""``body_tracking compile``: compiles the loops of image processing and of the extended filter in advance."""
+"""``body_tracking compile``: compiles the loops of image processing and of the body model in advance."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from body_tracking.systems import SYSTEMS
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the subcommand ``compile``."""
     text = (
-        "Compiles the loops of the image processing and of the filter ekf, and keeps the machine code in the user's "
-        "cache folder. Otherwise the first node that needs them takes half a minute to start."
+        "Compiles the loops of the image processing and of the body model (filter ekf, angles of its conventions), and "
+        "keeps the machine code in the user's cache folder. Otherwise the first node that needs them takes half a "
+        "minute to start."
     )
     subparsers.add_parser("compile", help=text, description=text).set_defaults(run=run)
 

@@ -23,7 +23,6 @@ from body_tracking.evaluation.reading import (
 )
 from body_tracking.kinematics.conventions import CONVENTIONS, Chain, convention
 from body_tracking.kinematics.euler import EulerAngles, EulerSequences
-from body_tracking.kinematics.tracking import SkeletonFit
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.pipeline import graph
 from body_tracking.recording.rig import RigReader
@@ -95,7 +94,9 @@ def read_segments(path: Path, topic: str | None = None, body: str | None = None)
             topic = topic or next(
                 (each for each in (graph.FILTERED, graph.FUSED) if each in bag.topics), graph.FILTERED
             )
-            fit, fitted = SkeletonFit(model), []
+            from body_tracking.kinematics.skeleton_fit import SkeletonFit  # imports numba: half a second
+
+            fit, fitted = SkeletonFit(), []
             skeletons = read_skeletons(bag, topic)
             for skeleton in skeletons:
                 estimate = fit.update(skeleton)

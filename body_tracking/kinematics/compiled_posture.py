@@ -1,4 +1,4 @@
-"""Posture prior, ranges of motion and inverse kinematics of one configuration at a time, compiled."""
+"""Posture prior, ranges of motion and least squares of inverse kinematics, one configuration at a time, compiled."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import numpy as np
 
 from body_tracking.core.compiled import compiled
 from body_tracking.core.skeleton import FloatArray, IntArray
-from body_tracking.kinematics.compiled_body import CompiledUpperBody, Tree, integrated, linearised
-from body_tracking.kinematics.inverse import HUBER, LIMIT_STDDEV, InverseKinematics
+from body_tracking.kinematics.compiled_body import Tree, integrated, linearised, placed
 from body_tracking.kinematics.posture import PosturePrior
 from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV, Ranges
 from body_tracking.kinematics.upper_body import UpperBody
@@ -23,6 +22,10 @@ _ANYWHERE = 1e-4
 """Prior information on each coordinate of the base, 1/m2 and 1/rad2."""
 _BASE = 6
 """First coordinate of the tangent after the base."""
+_HUBER = 2.5
+"""Standard deviations beyond which a point's residual counts linearly (Huber 1964)."""
+_LIMIT_STDDEV = math.radians(4.0)
+"""Standard deviation of the soft limits of the ranges of motion."""
 
 
 class PriorTable(NamedTuple):
@@ -90,10 +93,43 @@ def soft_values(q: FloatArray, table: PriorTable) -> FloatArray:
 
 
 @compiled
+def _level(rotation: FloatArray) -> tuple[float, float, float]:
+    """Direction x, y of a pelvis's left-right axis in the horizontal plane, and the length of its projection there."""
+    size = max(math.sqrt(rotation[0, 1] ** 2 + rotation[1, 1] ** 2), _VERTICAL)
+    return rotation[0, 1] / size, rotation[1, 1] / size, size
+
+
+@compiled
+def prior_residuals(q: FloatArray, rotation: FloatArray, table: PriorTable) -> tuple[FloatArray, FloatArray]:
+    """Deviations from the prior's mean: 26 coordinates, the sharing of the axial twist, the pelvis's tilt.
+
+    The tilt, forward and to the left, is measured by the sines of the vertical's angles with the horizontal axes.
+
+    Args:
+        q: (35,) configuration.
+        rotation: (3, 3) of the pelvis.
+        table: of the prior.
+
+    Returns:
+        (26,) values of ``SoftCoordinates``, (29,) residuals.
+    """
+    values = soft_values(q, table)
+    count = len(values)
+    residuals = np.zeros(count + 3)
+    for row in range(count):
+        residuals[row] = values[row] - table.mean[row]
+        residuals[count] += table.twist[row] * values[row]
+    x, y, _ = _level(rotation)
+    up = rotation[:, 2]
+    residuals[count + 1], residuals[count + 2] = y * up[0] - x * up[1], x * up[0] + y * up[1]
+    return values, residuals
+
+
+@compiled
 def prior_rows(
     q: FloatArray, rotation: FloatArray, turning: FloatArray, table: PriorTable
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Deviations from the prior's mean: 26 coordinates, the sharing of the axial twist, the pelvis's tilt.
+    """:func:`prior_residuals` and their derivatives.
 
     Args:
         q: (35,) configuration.
@@ -104,13 +140,10 @@ def prior_rows(
     Returns:
         (26,) values of ``SoftCoordinates``, (29,) residuals, (29, 32) their derivatives by the tangent.
     """
-    values = soft_values(q, table)
+    values, residuals = prior_residuals(q, rotation, table)
     count = len(values)
-    residuals = np.zeros(count + 3)
     gradients = np.zeros((count + 3, turning.shape[1]))
     for row in range(count):
-        residuals[row] = values[row] - table.mean[row]
-        residuals[count] += table.twist[row] * values[row]
         gradients[row, _BASE + row] = 1.0
     for side in range(len(table.rotations)):
         row = table.rotations[side]
@@ -131,13 +164,9 @@ def prior_rows(
         if table.twist[row] != 0.0:
             for column in range(turning.shape[1]):
                 gradients[count, column] += table.twist[row] * gradients[row, column]
-    # of the tilt: sines of the vertical's angles with the horizontal axes forward and to the left
-    size = max(math.sqrt(rotation[0, 1] ** 2 + rotation[1, 1] ** 2), _VERTICAL)
-    x, y = rotation[0, 1] / size, rotation[1, 1] / size
-    up = rotation[:, 2]
-    forward, left = y * up[0] - x * up[1], x * up[0] + y * up[1]
-    residuals[count + 1], residuals[count + 2] = forward, left
-    # both axes turn with the heading: (forward axis x left-right axis) / size
+    x, y, size = _level(rotation)
+    up, forward, left = rotation[:, 2], residuals[count + 1], residuals[count + 2]
+    # both horizontal axes turn with the heading: (forward axis x left-right axis) / size
     r = rotation[:, 1]
     heading = np.array([-x * r[2], -y * r[2], y * r[1] + x * r[0]]) / size
     by_forward = np.array([x * up[2], y * up[2], -(x * up[0] + y * up[1])])
@@ -167,15 +196,47 @@ def excess_of(values: FloatArray, table: PriorTable) -> FloatArray:
 
 
 @compiled
+def _away(points: FloatArray, target: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(19, 3) normalised residuals of the points, and (19,) their norms."""
+    residuals, sizes = np.empty(points.shape), np.empty(len(points))
+    for point in range(len(points)):
+        square = 0.0
+        for i in range(3):
+            residuals[point, i] = weights[point] * (target[point, i] - points[point, i])
+            square += residuals[point, i] ** 2
+        sizes[point] = math.sqrt(square)
+    return residuals, sizes
+
+
+@compiled
+def _cost(sizes: FloatArray, residuals: FloatArray, excess: FloatArray, table: PriorTable) -> float:
+    """Cost by norms of normalised residuals of points, residuals of the prior and the excess over the ranges."""
+    cost = 0.0
+    for size in sizes:
+        cost += 0.5 * size * size if size <= _HUBER else _HUBER * (size - 0.5 * _HUBER)
+    for row in range(len(residuals)):
+        cost += 0.5 * (residuals[row] / table.stddev[row]) ** 2
+    for over in excess:
+        cost += 0.5 * (over / _LIMIT_STDDEV) ** 2
+    return cost
+
+
+@compiled
+def costs(
+    q: FloatArray, target: FloatArray, weights: FloatArray, lengths: FloatArray, tree: Tree, table: PriorTable
+) -> FloatArray:
+    """(n,) costs of configurations (n, 35); other arguments as of :func:`normal_equations`."""
+    result = np.empty(len(q))
+    for number in range(len(q)):
+        points, rotations, _ = placed(q[number], lengths, tree)
+        values, residuals = prior_residuals(q[number], rotations[0], table)
+        result[number] = _cost(_away(points, target, weights)[1], residuals, excess_of(values, table), table)
+    return result
+
+
+@compiled
 def normal_equations(
-    q: FloatArray,
-    target: FloatArray,
-    weights: FloatArray,
-    lengths: FloatArray,
-    huber: float,
-    limit: float,
-    tree: Tree,
-    table: PriorTable,
+    q: FloatArray, target: FloatArray, weights: FloatArray, lengths: FloatArray, tree: Tree, table: PriorTable
 ) -> tuple[FloatArray, FloatArray, float]:
     """One Gauss-Newton step towards points, with ranges of motion and posture as priors.
 
@@ -184,8 +245,6 @@ def normal_equations(
         target: (19, 3) points; anything where their weight is 0.
         weights: (19,) inverse standard deviations.
         lengths: (21,) metres.
-        huber: deviations beyond which a residual counts linearly.
-        limit: radians, deviation of the limits of the ranges.
         tree: of the model.
         table: of the prior.
 
@@ -194,30 +253,22 @@ def normal_equations(
     """
     points, rotations, _, observation, turning = linearised(q, lengths, tree)
     values, residuals, rows = prior_rows(q, rotations[0], turning[0], table)
-    size, count, cost = turning.shape[2], len(points), 0.0
-    jacobian, error = np.empty((3 * count, size)), np.empty((3 * count, 1))
-    for point in range(count):
-        square = 0.0
+    excess, (away, sizes) = excess_of(values, table), _away(points, target, weights)
+    size = turning.shape[2]
+    jacobian, error = np.empty((3 * len(points), size)), np.empty((3 * len(points), 1))
+    for point in range(len(points)):
+        root = math.sqrt(min(1.0, _HUBER / max(sizes[point], _SMALL)))
         for i in range(3):
-            error[3 * point + i, 0] = weights[point] * (target[point, i] - points[point, i])
-            square += error[3 * point + i, 0] ** 2
-        away = math.sqrt(square)
-        cost += 0.5 * square if away <= huber else huber * (away - 0.5 * huber)
-        root = math.sqrt(min(1.0, huber / max(away, _SMALL)))
-        for i in range(3):
-            error[3 * point + i, 0] *= root
+            error[3 * point + i, 0] = root * away[point, i]
             for k in range(size):
                 jacobian[3 * point + i, k] = weights[point] * root * observation[3 * point + i, k]
-    excess = excess_of(values, table)
     off = np.empty((len(rows), 1))
     for row in range(len(rows)):
         precision = 1.0 / table.stddev[row] ** 2
         pull = precision * residuals[row]
-        cost += 0.5 * precision * residuals[row] ** 2
         if row < len(excess) and excess[row] != 0.0:
-            precision += 1.0 / limit**2
-            pull += excess[row] / limit**2
-            cost += 0.5 * (excess[row] / limit) ** 2
+            precision += 1.0 / _LIMIT_STDDEV**2
+            pull += excess[row] / _LIMIT_STDDEV**2
         root = math.sqrt(precision)
         off[row, 0] = pull / root
         for k in range(size):
@@ -226,7 +277,7 @@ def normal_equations(
     gradient = np.dot(jacobian.T, error) - np.dot(rows.T, off)
     for k in range(_BASE):
         normal[k, k] += _ANYWHERE  # determines the base with too few points
-    return normal, gradient.reshape(-1), cost
+    return normal, gradient.reshape(-1), _cost(sizes, residuals, excess, table)
 
 
 @compiled
@@ -237,8 +288,6 @@ def descended(
     lengths: FloatArray,
     iterations: int,
     tolerance: float,
-    huber: float,
-    limit: float,
     tree: Tree,
     table: PriorTable,
 ) -> tuple[FloatArray, FloatArray, float]:
@@ -248,16 +297,14 @@ def descended(
     tolerance.
     """
     damping = 1e-3
-    normal, gradient, cost = normal_equations(q, target, weights, lengths, huber, limit, tree, table)
+    normal, gradient, cost = normal_equations(q, target, weights, lengths, tree, table)
     for _ in range(iterations):
         damped = normal.copy()
         for k in range(len(damped)):
             damped[k, k] *= 1.0 + damping
         step: FloatArray = np.linalg.solve(damped, gradient).astype(np.float64)
         moved = integrated(q, step, tree)
-        new_normal, new_gradient, new_cost = normal_equations(
-            moved, target, weights, lengths, huber, limit, tree, table
-        )
+        new_normal, new_gradient, new_cost = normal_equations(moved, target, weights, lengths, tree, table)
         if new_cost < cost:
             q, normal, gradient, cost = moved, new_normal, new_gradient, new_cost
             damping = max(0.1 * damping, 1e-7)
@@ -268,35 +315,3 @@ def descended(
             if damping > 1e8:
                 break
     return q, normal, cost
-
-
-class CompiledInverse(InverseKinematics):
-    """:class:`InverseKinematics` with compiled steps, which take a tenth of the time."""
-
-    model: CompiledUpperBody
-
-    def __init__(self, model: CompiledUpperBody, ranges: Ranges, table: PriorTable) -> None:
-        super().__init__(model, ranges)
-        self._table = table
-
-    def _descended(
-        self,
-        q: FloatArray,
-        target: FloatArray,
-        weights: FloatArray,
-        lengths: FloatArray,
-        max_iterations: int,
-        tolerance: float,
-    ) -> tuple[FloatArray, FloatArray, float]:
-        return descended(
-            q,
-            target,
-            weights,
-            lengths,
-            max_iterations,
-            tolerance,
-            HUBER,
-            LIMIT_STDDEV,
-            self.model.tree,
-            self._table,
-        )

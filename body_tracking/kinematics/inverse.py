@@ -20,16 +20,15 @@ import numpy as np
 from body_tracking.core import so3
 from body_tracking.core.body_model import ModelError
 from body_tracking.core.skeleton import BoolArray, FloatArray, Joint
+from body_tracking.kinematics.compiled_body import CompiledUpperBody
+from body_tracking.kinematics.compiled_posture import costs, descended, normal_equations, prior_table
 from body_tracking.kinematics.posture import PosturePrior
-from body_tracking.kinematics.ranges import TWIST_SHARING_STDDEV, Ranges
-from body_tracking.kinematics.upper_body import UpperBody
+from body_tracking.kinematics.ranges import Ranges
 
 _J = Joint
 _TINY = 1e-9
 _STRAIGHT = 0.15
 """Sine of the elbow's flexion below which the forearm does not determine the upper arm's axial rotation."""
-LIMIT_STDDEV = np.radians(4.0)
-"""Standard deviation of the soft limits of the ranges of motion."""
 _TURNED = np.radians(60.0)
 """Radians: axial rotation of a hand beyond which two fits are different minima, which are half a turn apart."""
 _NEARLY_STRAIGHT = 0.5
@@ -38,9 +37,6 @@ moves the wrist of a forearm of 0.25 m by 0.09 m, more than any sensor's noise."
 _TURNS = np.radians(np.arange(0.0, 360.0, 45.0))
 _PRONATIONS = 13
 """Steps of 15 degrees move a thumb's point by 7 mm, less than the distance between minima."""
-_TWIST_STDDEV = np.radians(TWIST_SHARING_STDDEV)
-HUBER = 2.5
-"""Standard deviations beyond which a point's residual counts linearly (Huber 1964)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,10 +59,11 @@ class Fit:
 class InverseKinematics:
     """Fits ``upper_body`` to points: the inverse kinematics, which Schlagenhauf (2017, eq. 3.4) leaves to a filter."""
 
-    def __init__(self, model: UpperBody, ranges: Ranges | None = None) -> None:
+    def __init__(self, model: CompiledUpperBody) -> None:
         self.model = model
-        self.ranges = ranges or Ranges(model)
+        self.ranges = Ranges(model)
         self.prior = PosturePrior(model, self.ranges)
+        self._tables = model.tree, prior_table(model, self.ranges, self.prior)
         self._point = {Joint(joint): number for number, joint in enumerate(model.joints)}
         names = model.coordinate_names
         self._column = {name: number for number, name in enumerate(names)}
@@ -147,35 +144,28 @@ class InverseKinematics:
         Raises:
             ModelError: no trunk is seen, and no start was given.
         """
-        measured = np.isfinite(positions).all(axis=1) & np.isfinite(stddev)
+        target, weights = _weighted(positions, stddev)
         alternatives = q is None if alternatives is None else alternatives
         if q is None:
-            q = self.start(np.where(measured[:, None], positions, np.nan))
-        weights = np.where(measured, 1.0 / np.where(measured, stddev, 1.0), 0.0)
-        target = np.where(measured[:, None], positions, 0.0)
-        found = self._descended(q, target, weights, lengths, max_iterations, tolerance)
+            q = self.start(np.where(weights[:, None] > 0.0, positions, np.nan))
+        found = descended(q, target, weights, lengths, max_iterations, tolerance, *self._tables)
         if alternatives:
             for other in self.turned_about(found[0], positions, stddev, lengths):
-                another = self._descended(other, target, weights, lengths, max_iterations, tolerance)
+                another = descended(other, target, weights, lengths, max_iterations, tolerance, *self._tables)
                 found = another if another[2] < found[2] else found
         q, normal, cost = found
         branch = self.ranges.nearest_branch(q)
         if branch is not None:
             q = branch[0]
-            normal = self._normal_equations(q, target, weights, lengths)[0]
+            normal = normal_equations(q, target, weights, lengths, *self._tables)[0]
         fitted = self.model.forward(q, lengths).positions
-        residuals = np.where(measured[:, None], positions - fitted, np.nan)
+        residuals = np.where(weights[:, None] > 0.0, positions - fitted, np.nan)
         covariance = np.linalg.inv(normal).astype(np.float64)
         return Fit(q, covariance, residuals, cost)
 
     def cost(self, q: FloatArray, positions: FloatArray, stddev: FloatArray, lengths: FloatArray) -> FloatArray:
-        """(...,) :attr:`Fit.cost` at configurations (..., 35); other arguments as of :meth:`solve`."""
-        measured = np.isfinite(positions).all(axis=1) & np.isfinite(stddev)
-        weights = np.where(measured, 1.0 / np.where(measured, stddev, 1.0), 0.0)
-        target = np.where(measured[:, None], positions, 0.0)
-        posture = self.model.forward(q, lengths)
-        size = _sizes((target - posture.positions) * weights[:, None])
-        return self._costs(size, self.ranges.values(q), self.prior.tilt_of(posture.rotations[..., 0, :, :]))
+        """(n,) :attr:`Fit.cost` at configurations (n, 35); other arguments as of :meth:`solve`."""
+        return costs(q, *_weighted(positions, stddev), lengths, *self._tables)
 
     def turned_about(
         self, q: FloatArray, positions: FloatArray, stddev: FloatArray, lengths: FloatArray
@@ -241,78 +231,6 @@ class InverseKinematics:
         turned[:, bent] = np.clip(turned[:, bent], low[bent], high[bent])
         return turned
 
-    def _descended(
-        self,
-        q: FloatArray,
-        target: FloatArray,
-        weights: FloatArray,
-        lengths: FloatArray,
-        max_iterations: int,
-        tolerance: float,
-    ) -> tuple[FloatArray, FloatArray, float]:
-        """(35,) the nearest minimum, (32, 32) the normal equations and the cost there."""
-        damping = 1e-3
-        normal, gradient, cost = self._normal_equations(q, target, weights, lengths)
-        for _ in range(max_iterations):
-            damped = normal + damping * np.diag(normal.diagonal())
-            step = np.linalg.solve(damped, gradient).astype(np.float64)
-            moved = self.model.integrate(q, step)
-            new_normal, new_gradient, new_cost = self._normal_equations(moved, target, weights, lengths)
-            if new_cost < cost:
-                done = bool(np.abs(step).max() < tolerance)
-                q, normal, gradient, cost = moved, new_normal, new_gradient, new_cost
-                damping = max(0.1 * damping, 1e-7)
-                if done:
-                    break
-            else:
-                damping *= 10.0
-                if damping > 1e8:
-                    break
-        return q, normal, cost
-
-    def _costs(self, size: FloatArray, soft: FloatArray, tilt: FloatArray) -> FloatArray:
-        """(...,) costs by normalised residuals (..., 19), values of the ranges (..., 26) and the tilt (..., 2)."""
-        points = np.where(size <= HUBER, 0.5 * size**2, HUBER * (size - 0.5 * HUBER)).sum(axis=-1)
-        off = (soft - self.prior.mean) / self.prior.stddev
-        tilts = tilt / self.prior.tilt_stddev
-        over = self.ranges.excess_of(soft) / LIMIT_STDDEV
-        twist = soft @ self.ranges.twist / _TWIST_STDDEV
-        result: FloatArray = points + 0.5 * ((off**2 + over**2).sum(axis=-1) + (tilts**2).sum(axis=-1) + twist**2)
-        return result
-
-    def _normal_equations(
-        self, q: FloatArray, target: FloatArray, weights: FloatArray, lengths: FloatArray
-    ) -> tuple[FloatArray, FloatArray, float]:
-        """(nv, nv) and (nv,) of one Gauss-Newton step, and the cost at ``q``."""
-        lines = self.model.linearise(q, lengths)
-        residual = (target - lines.posture.positions) * weights[:, None]
-        size = _sizes(residual)
-        bounded = np.minimum(1.0, HUBER / np.maximum(size, _TINY))
-        jacobian = (lines.jacobian * (weights * np.sqrt(bounded))[:, None, None]).reshape(-1, self.model.nv)
-        error = (residual * np.sqrt(bounded)[:, None]).reshape(-1)
-        normal = jacobian.T @ jacobian
-        gradient = jacobian.T @ error
-
-        soft = self.ranges.soft_coordinates(q)
-        off = soft.values - self.prior.mean
-        over = self.ranges.excess_of(soft.values)
-        prior = 1.0 / self.prior.stddev**2
-        limit = np.where(over != 0.0, 1.0 / LIMIT_STDDEV**2, 0.0)
-        inner = soft.gradients.T @ ((prior + limit)[:, None] * soft.gradients)
-        normal[6:, 6:] += inner
-        gradient[6:] -= soft.gradients.T @ (prior * off + limit * over)
-        twist = float(self.ranges.twist @ soft.values)
-        sharing = 1.0 / _TWIST_STDDEV**2
-        normal[6:, 6:] += sharing * np.outer(self.ranges.twist, self.ranges.twist)
-        gradient[6:] -= sharing * twist * self.ranges.twist
-        tilt = self.prior.tilt(lines)
-        upright = tilt.gradients / self.prior.tilt_stddev[:, None]
-        normal += upright.T @ upright
-        gradient -= upright.T @ (tilt.values / self.prior.tilt_stddev)
-        # a weak prior determines the base with too few points
-        normal[np.arange(6), np.arange(6)] += 1e-4
-        return normal, gradient, float(self._costs(size, soft.values, tilt.values))
-
     def _set_trunk(self, q: FloatArray, part: str, rotation: FloatArray) -> None:
         """Set flexion, lateral and axial angle from an intrinsic y-x-z rotation (3, 3)."""
         q[self._scalar[f"{part}_flexion"]] = np.arctan2(rotation[0, 2], rotation[2, 2])
@@ -373,10 +291,11 @@ class InverseKinematics:
         return rotation
 
 
-def _sizes(residuals: FloatArray) -> FloatArray:
-    """(...,) norms of vectors (..., 3)."""
-    result: FloatArray = np.sqrt((residuals * residuals).sum(axis=-1))
-    return result
+def _weighted(positions: FloatArray, stddev: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(19, 3) points, zeros where not measured, and (19,) their weights."""
+    measured = np.isfinite(positions).all(axis=1) & np.isfinite(stddev)
+    weights = np.where(measured, 1.0 / np.where(measured, stddev, 1.0), 0.0)
+    return np.where(measured[:, None], positions, 0.0), weights
 
 
 def _unit(v: FloatArray) -> FloatArray:

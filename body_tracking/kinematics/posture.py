@@ -21,12 +21,9 @@ three shipped recordings, which are simulated. Figures over these recordings are
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
-from body_tracking.core import so3
-from body_tracking.core.body_model import Linearisation
 from body_tracking.core.skeleton import BoolArray, FloatArray
 from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UpperBody
@@ -55,22 +52,6 @@ UNIFORM = ("elbow_flexion",)
 TILT_STDDEV = (10.0, 6.0)
 """Degrees: tilt of the pelvis against gravity, forward and sideways."""
 
-_VERTICAL = 1e-9
-"""Least horizontal part of the pelvis's left-right axis, for a pelvis that lies on its side."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Tilt:
-    """Tilt of the pelvis against gravity.
-
-    Attributes:
-        values: (2,) sines of the tilt forward and to the left.
-        gradients: (2, 32) by the tangent.
-    """
-
-    values: FloatArray
-    gradients: FloatArray
-
 
 class PosturePrior:
     """Mean and standard deviation of each coordinate of ``upper_body`` after the base.
@@ -81,7 +62,7 @@ class PosturePrior:
     Attributes:
         mean, stddev: (26,) radians, of ``SoftCoordinates``.
         postural: (26,) which of them are in :data:`STDDEV`.
-        tilt_stddev: (2,) radians, of :class:`Tilt`.
+        tilt_stddev: (2,) radians: tilt of the pelvis against gravity, forward and to the left.
     """
 
     def __init__(self, model: UpperBody, ranges: Ranges) -> None:
@@ -93,31 +74,3 @@ class PosturePrior:
         flat = (ranges.high - ranges.low) / math.sqrt(12.0)
         self.stddev: FloatArray = np.where(self.postural, postural, np.where(uniform, flat, ranges.stddev))
         self.tilt_stddev: FloatArray = np.radians(TILT_STDDEV)
-
-    @staticmethod
-    def tilt_of(rotation: FloatArray) -> FloatArray:
-        """(..., 2) sines of the tilt of a pelvis forward and to the left, of its rotations (..., 3, 3)."""
-        axes = _horizontal_axes(rotation)
-        values: FloatArray = (axes @ rotation[..., :, 2:])[..., 0]
-        return values
-
-    @staticmethod
-    def tilt(lines: Linearisation) -> Tilt:
-        """The tilt of the pelvis at one configuration, with its derivative."""
-        rotation, turning = lines.posture.rotations[0], lines.rotation_jacobian[0]
-        axes = _horizontal_axes(rotation)
-        forward, left = axes @ rotation[:, 2]
-        gradients: FloatArray = axes @ so3.skew(-rotation[:, 2]) @ turning
-        # both axes turn with the heading
-        size = max(float(np.hypot(rotation[0, 1], rotation[1, 1])), _VERTICAL)
-        heading = (-axes[0] / size) @ so3.skew(-rotation[:, 1]) @ turning
-        gradients += np.outer([left, -forward], heading)
-        return Tilt(np.array([forward, left]), gradients)
-
-
-def _horizontal_axes(rotation: FloatArray) -> FloatArray:
-    """(..., 2, 3) horizontal unit vectors forward and to the left of a pelvis of rotation (..., 3, 3)."""
-    x, y = rotation[..., 0, 1], rotation[..., 1, 1]
-    size = np.maximum(np.hypot(x, y), _VERTICAL)
-    x, y, zero = x / size, y / size, np.zeros_like(x)
-    return np.stack([np.stack([y, -x, zero], axis=-1), np.stack([x, y, zero], axis=-1)], axis=-2)

@@ -159,10 +159,7 @@ class Ranges:
 
         The swing of a shoulder is bounded as a whole: its two components share the excess in their proportion.
         """
-        return self.excess_of(self.values(q))
-
-    def excess_of(self, values: FloatArray) -> FloatArray:
-        """As :meth:`excess`, from the values (..., 26) of :class:`SoftCoordinates`."""
+        values = self.values(q)
         excess = np.maximum(values - self.high, 0.0) + np.minimum(values - self.low, 0.0)
         for rows in self._soft:
             swing = values[..., rows[:2]]

@@ -134,6 +134,8 @@ class AnglesStage(Stage):
         self._covariances: dict[str, str] = {}
         if self.source == graph.SKELETON_INPUT:
             self.inputs = (skeleton_input(graph.FILTERED, values),)
+            for stream in self.streams.values() if convention != graph.POSITIONAL else ():
+                stream.prepare()
         elif self.source == graph.MODEL_INPUT:
             qos, perishable = skeleton_qos(values), not values["reliable"]
             ports = []
@@ -203,7 +205,7 @@ class AnglesStage(Stage):
         """The convention, and the counters of the fits."""
         fits: Counter[str] = Counter()
         for stream in self.streams.values():
-            fits.update(stream.fit.counters)
+            fits.update(stream.counters)
         values: dict[str, object] = {f"fit {name}": count for name, count in fits.items()}
         if self._unpaired:
             values["unpaired"] = self._unpaired

@@ -13,12 +13,12 @@ from body_tracking.core.joint_angles import JointAngles
 from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from body_tracking.kinematics.conventions import ConventionError, angles_of
 from body_tracking.kinematics.positional import positional_angles
+from body_tracking.kinematics.skeleton_fit import SkeletonFit
 from body_tracking.kinematics.tracking import (
     ALL_CONVENTIONS,
     AngleStream,
     JumpDoubt,
     LengthChanges,
-    SkeletonFit,
     segment_poses,
 )
 from body_tracking.kinematics.upper_body import UNOBSERVED, UpperBody
@@ -70,7 +70,7 @@ def followed(fit: SkeletonFit, times: FloatArray, noise: np.random.Generator | N
 
 def test_lengths_pose_and_rates_of_a_person_come_back() -> None:
     times = np.arange(60) * FRAME
-    estimates = followed(SkeletonFit(MODEL), times)
+    estimates = followed(SkeletonFit(), times)
     for time, estimate in zip(times[5:], estimates[5:], strict=True):
         assert_allclose(estimate.lengths, LENGTHS, atol=1e-6)
         assert (estimate.stamp_ns, estimate.frame_id, estimate.body) == (round(time * NANOSECONDS), "world", 3)
@@ -87,7 +87,7 @@ def test_lengths_pose_and_rates_of_a_person_come_back() -> None:
 def test_errors_by_noise_are_within_the_stated_deviations() -> None:
     rng = np.random.default_rng(4)
     errors = []
-    for estimate in followed(SkeletonFit(MODEL), np.arange(draws(100, 150)) * FRAME, rng)[40:]:
+    for estimate in followed(SkeletonFit(), np.arange(draws(100, 150)) * FRAME, rng)[40:]:
         stddev = np.sqrt(estimate.covariance.diagonal()[: MODEL.nv])
         errors.append(MODEL.difference(estimate.q, motion(estimate.stamp_ns / NANOSECONDS)[0]) / stddev)
     observed = np.array([name not in UNOBSERVED for name in MODEL.coordinate_names])
@@ -96,7 +96,7 @@ def test_errors_by_noise_are_within_the_stated_deviations() -> None:
 
 
 def test_a_length_that_is_never_seen_is_the_other_sides() -> None:
-    fit = SkeletonFit(MODEL)
+    fit = SkeletonFit()
     for time in np.arange(20) * FRAME:
         skeleton = seen(time)
         skeleton.states[[Joint.THUMB_LEFT, Joint.HAND_TIP_LEFT]] = TrackingState.NOT_TRACKED
@@ -110,7 +110,7 @@ def test_a_length_that_is_never_seen_is_the_other_sides() -> None:
 
 
 def test_without_a_trunk_there_is_nothing_and_then_it_goes_on() -> None:
-    fit = SkeletonFit(MODEL)
+    fit = SkeletonFit()
     followed(fit, np.arange(10) * FRAME)
     hidden = seen(10 * FRAME)
     hidden.states[[Joint.SPINE_BASE, Joint.SPINE_MID]] = TrackingState.NOT_TRACKED
@@ -127,7 +127,7 @@ def test_without_a_trunk_there_is_nothing_and_then_it_goes_on() -> None:
 
 
 def test_without_velocities_the_rates_are_unknown() -> None:
-    estimate = SkeletonFit(MODEL).update(replace(seen(0.0), velocities=None))
+    estimate = SkeletonFit().update(replace(seen(0.0), velocities=None))
     assert estimate is not None
     assert np.isnan(estimate.velocity).all()
     assert np.isinf(estimate.covariance.diagonal()[MODEL.nv :]).all()
@@ -175,7 +175,7 @@ def test_another_convention_is_refused() -> None:
 
 
 def test_segments_stand_where_their_joints_are() -> None:
-    (estimate,) = followed(SkeletonFit(MODEL), np.array([0.0]))
+    (estimate,) = followed(SkeletonFit(), np.array([0.0]))
     origins, quats = segment_poses(estimate, MODEL)
     points = MODEL.forward(estimate.q, estimate.lengths).positions
     forearm = MODEL.segment_names.index("forearm_left")

@@ -12,7 +12,7 @@ from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.sensor_errors import SensorErrors
 from body_tracking.filters.ekf.sources import PER_SOURCE
 from body_tracking.filters.ekf.state import NOBODY, Measurement, SensorState, State, StateSpace
-from body_tracking.kinematics.compiled_posture import CompiledInverse
+from body_tracking.kinematics.inverse import InverseKinematics
 from body_tracking.kinematics.lengths import SegmentLengths
 
 _REST_NS = NANOSECONDS // 4
@@ -54,7 +54,7 @@ class PoseSearch:
     ) -> None:
         self._space, self._model, self._sensors = space, space.model, sensors
         self._parameters, self._counters, self._gate = parameters, counters, parameters.gate
-        self.inverse = CompiledInverse(space.model, space.ranges, space.prior_table)
+        self.inverse = InverseKinematics(space.model)
         self.started_by: tuple[str, int] | None = None
         self._velocity_variance = np.full(space.nv, _FIRST_TURN_RATE**2)
         self._velocity_variance[:3] = _FIRST_SPEED**2
@@ -209,7 +209,7 @@ class PoseSearch:
             return state
         if self._contradicts(state, fit.q) or (other and self._contradicts(state, fresh.q)):
             return state
-        present = float(self.inverse.cost(state.q, points, stddev, state.lengths))
+        present = float(self.inverse.cost(state.q[None], points, stddev, state.lengths)[0])
         whole = int(np.isfinite(points).all(axis=1).sum()) >= _WHOLE
         if other and whole and fresh.cost < share * min(fit.cost, present):
             self._counters["restarts"] += 1
