@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from body_tracking.core.names import TF_STATIC
 from body_tracking.core.parameters import Parameter, Value, fields_of, parameters_from
 from body_tracking.core.qos import LATCHED, Qos
 from body_tracking.core.sensor_poses import CalibrationResult
-from body_tracking.core.skeleton import Joint, Skeleton
+from body_tracking.core.skeleton import NANOSECONDS, Joint, Skeleton
 from body_tracking.messages.codecs import Clock, Pose, Poses, SensorClock
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.people import SubjectSelector
@@ -25,6 +26,8 @@ _TRUNKS: Final = (0.1, 1.0)
 """Metres: least and greatest distance of SPINE_BASE and SPINE_SHOULDER, 0.5 in an adult."""
 _ODD_FRAMES: Final = 30
 """Frames in a row with another distance from which on it is reported: an outlier lasts less."""
+_LIVE_S: Final = 10.0
+"""Seconds between the stamp of a sensor's frame and the wall clock: of sensors less, of a recording more."""
 _LEVEL = "world would tilt or move under everyone who uses it"
 _FIXED = {
     "method": "what one method has estimated is no start for the other",
@@ -46,7 +49,12 @@ class CalibrationStage(Stage):
             "YAML file: loaded at the start if it exists, saved when the result changes; or empty",
             fixed="it is loaded at the start",
         ),
-        Parameter("save", True, "whether calibration_file is written; by up and launch not where a bag finds one"),
+        Parameter(
+            "save",
+            True,
+            "whether calibration_file is written; never where it existed and stamps are more than 10 s from the wall "
+            "clock, as those of a recording",
+        ),
         WORLD_FRAME,
         *parameters_from(
             CalibrationParameters,
@@ -70,11 +78,16 @@ class CalibrationStage(Stage):
         parameters = CalibrationParameters(**fields_of(CalibrationParameters, values))
         self.calibration = OnlineCalibration(sensors, parameters, str(values["reference"]) or None)
         self._file = Path(str(values["calibration_file"])).expanduser() if values["calibration_file"] else None
+        self._exists = False
+        """Whether there was a file at the start, which a recording must not change."""
         if self._file is not None and self._file.exists():
             loaded = load(self._file)
             self.calibration.load(loaded)
             note = "" if values["save"] else ", not to be written"
             self.events.append(f"{self._file}: loaded{note}{lacking(loaded, sensors)}")
+            self._exists = True
+        self._recorded, self._recorded_s = 0, 0.0
+        """Frames in a row with stamps as in a recording, and seconds from the last one to the wall clock."""
         self._unsaved = self._saved = False
         self._subjects = {sensor: SubjectSelector() for sensor in sensors}
         self._odd: dict[str, tuple[int, float]] = {}
@@ -106,6 +119,7 @@ class CalibrationStage(Stage):
         sensor = self._sensors[topic]
         for skeleton in payload[:1]:
             self._check_size(sensor, skeleton)
+            self._check_time(skeleton)
         subject = self._subjects[sensor].pick(payload)
         if subject is None:
             return ()
@@ -140,8 +154,24 @@ class CalibrationStage(Stage):
         elif 0.0 < length < math.inf:  # nor NaN, nor zeros in place of joints
             self._odd[sensor] = self._odd.get(sensor, (0, 0.0))[0] + 1, length
 
+    def _check_time(self, skeleton: Skeleton) -> None:
+        """Count the frames in a row that come from a recording, whoever plays it, and in whatever time.
+
+        Not for good before many: after a standstill of the process those that have waited are old, too.
+        """
+        seconds = abs(time.time_ns() - skeleton.stamp_ns) / NANOSECONDS
+        if seconds > _LIVE_S:
+            self._recorded, self._recorded_s = self._recorded + 1, seconds
+        elif self._recorded < _ODD_FRAMES:
+            self._recorded = 0
+
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
         level, text, values = self.calibration.status()
+        if self._exists and self.values["save"] and self._recorded >= _ODD_FRAMES:
+            text += (
+                f"; {self._file} is not written: stamps are {self._recorded_s:.0f} s from the time of this computer, "
+                "as of a recording"
+            )
         odd = [
             f"{sensor}: a trunk of {length:.3g} m, coordinates must be metres"
             for sensor, (count, length) in self._odd.items()
@@ -151,6 +181,8 @@ class CalibrationStage(Stage):
 
     def save(self) -> None:
         """Write the file, if anything changed."""
+        if self._exists and self._recorded:
+            return  # the people and clocks of a recording may not be those of the file
         if self._file is not None and self._unsaved and self.values["save"]:
             # The published poses, not the estimates toward which they still slew: a restart must not jump.
             save(self.calibration.current_update().result, self._file)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,10 +18,13 @@ from body_tracking.calibration.stage import CalibrationStage
 from body_tracking.calibration.storage import load, save
 from body_tracking.core.clocks import ClockModel
 from body_tracking.core.sensor_poses import CalibrationResult, SensorPose, SensorQuality, level_pose
-from body_tracking.core.skeleton import NANOSECONDS
+from body_tracking.core.skeleton import NANOSECONDS, Skeleton, TrackingState
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.stage import Now
 from body_tracking.recording.rosbag2 import BAG_WIRE
+
+BODY = np.random.default_rng(0).normal(scale=0.3, size=(25, 3)) + [0.0, 0.0, 2.0]
+TRACKED = np.full(25, TrackingState.TRACKED, dtype=np.uint8)
 
 
 def example(seed: int = 0) -> CalibrationResult:
@@ -69,6 +73,46 @@ def test_the_clock_of_a_file_is_published_as_the_offset_that_was_estimated(tmp_p
         stage._unsaved = True
         stage.save()  # the drift is kept for the next session's start
         assert load(path).clocks["kinect2"].drift_ppm == drift_ppm
+
+
+@pytest.mark.parametrize("stamps", ["of sensors", "of a recording"])
+@pytest.mark.parametrize("existed", [True, False])
+def test_a_recording_played_beside_changes_no_existing_file(tmp_path: Path, stamps: str, existed: bool) -> None:
+    path = tmp_path / "room.yaml"
+    if existed:
+        save(example(), path)
+    values = {each.name: each.default for each in CalibrationStage.PARAMETERS} | {"calibration_file": str(path)}
+    stage = CalibrationStage(values)
+    before = path.read_text() if existed else ""
+    at_ns = time.time_ns() - (3600 * NANOSECONDS if stamps == "of a recording" else 0)
+    for number in range(40):
+        person = Skeleton(at_ns + number * NANOSECONDS // 30, "kinect1_optical_frame", BODY, TRACKED)
+        list(stage.take("/kinect1/skeleton", [person], Now(person.stamp_ns, person.stamp_ns)))
+    stage._unsaved = True
+    if existed:
+        stage.calibration.load(example(seed=1))
+    stage.save()
+    kept = existed and stamps == "of a recording"
+    assert (path.read_text() == before) is kept
+    text = stage.state(at_ns)[1]
+    assert ("room.yaml is not written: stamps are 3" in text) is kept
+
+
+def test_frames_that_waited_during_a_standstill_are_those_of_a_sensor(tmp_path: Path) -> None:
+    path = tmp_path / "room.yaml"
+    save(example(), path)
+    values = {each.name: each.default for each in CalibrationStage.PARAMETERS} | {"calibration_file": str(path)}
+    stage = CalibrationStage(values)
+    before = path.read_text()
+    for age_s, written in ((60, False), (0, True)):
+        for number in range(10):
+            stamp_ns = time.time_ns() - age_s * NANOSECONDS + number
+            person = Skeleton(stamp_ns, "kinect1_optical_frame", BODY, TRACKED)
+            list(stage.take("/kinect1/skeleton", [person], Now(stamp_ns, stamp_ns)))
+        stage.calibration.load(example(seed=1))
+        stage._unsaved = True
+        stage.save()
+        assert (path.read_text() != before) is written
 
 
 @pytest.mark.parametrize(
