@@ -16,6 +16,18 @@ from body_tracking.core.errors import BodyTrackingError
 if TYPE_CHECKING:
     from body_tracking.pipeline.system import Command
 
+_MEANT = {
+    "play": "up --bag BAG",
+    "demo": "up --bag bags/tpose_wave --viewer",
+    "record": "up --record NEW_BAG",
+    "start": "up",
+    "run": "up",
+    "launch": "up",
+    "info": "bag info BAG",
+    "viewer": "view",
+    "plot": "show BAG -o PNG",
+}
+"""Command lines for words that are no commands here."""
 _FIRST = ("view", "up", "replay", "show", "calibrate", "doctor")
 """Commands that come first in the help: those of a first session."""
 
@@ -36,6 +48,7 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
         "and the same chain offline over recordings.",
         epilog="body_tracking COMMAND --help prints the options of a command; body_tracking alone says what to do.",
     )
+    top.meant = _MEANT
     top.add_argument("--version", action="version", version=f"body_tracking {__version__}")
     subparsers = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
     commands = subcommands()

@@ -145,6 +145,8 @@ def options_from(args: argparse.Namespace) -> dict[str, Value]:
             value = tuple(each for each in value.split(",") if each)
             if not value:
                 raise graph.GraphError("sensors: no name")
+        elif isinstance(option.default, tuple):
+            value = [part for each in value for part in each.split(",") if part]
         found[name] = tuple(value) if isinstance(option.default, tuple) else str(value) if option.path else value
     return found
 

@@ -111,6 +111,22 @@ def test_missing_files_are_reported_in_one_line(
         ("camera show image.png -o out.png --large", "unrecognized arguments: --large", "body_tracking camera show"),
         ("replya bag", "argument COMMAND: invalid choice: 'replya'; did you mean 'replay'?", "body_tracking"),
         ("up --filter efk", "argument --filter: invalid choice: 'efk'; did you mean 'ekf'?", "body_tracking up"),
+        ("up --filter EKF", "argument --filter: invalid choice: 'EKF'; did you mean 'ekf'?", "body_tracking up"),
+        (
+            "view --bag bags/wave",
+            "unrecognized arguments: --bag bags/wave; the page lists the recordings; `body_tracking up --bag BAG "
+            "--viewer` shows one at once",
+            "body_tracking view",
+        ),
+        ("view --bag=wave", "unrecognized arguments: --bag=wave; the page lists", "body_tracking view"),
+        ("view bags/wave", "unrecognized arguments: bags/wave; the page lists", "body_tracking view"),
+        (
+            "replay --bag bags/wave -o out",
+            "unrecognized arguments: --bag; the recording stands here without '--bag'",
+            "body_tracking replay",
+        ),
+        ("play bags/wave", "argument COMMAND: invalid choice: 'play'; did you mean 'up --bag BAG'?", "body_tracking"),
+        ("record", "argument COMMAND: invalid choice: 'record'; did you mean 'up --record NEW_BAG'?", "body_tracking"),
         ("up --filter xyz", "argument --filter: invalid choice: 'xyz' (choose from ", "body_tracking up"),
     ],
 )
@@ -123,6 +139,15 @@ def test_a_wrong_argument_is_one_line_that_names_the_help_of_its_command(
     captured = capsys.readouterr()
     assert captured.err.startswith(f"body_tracking: {said}") and captured.err.endswith(f" (see {command} --help)\n")
     assert captured.err.count("\n") == 1 and not captured.out
+
+
+@pytest.mark.parametrize("given", ["tpose_wav", "tpose_wave", "bags/tpose_wvae", "bags/tpose_wave.bag"])
+def test_a_mistyped_recording_is_answered_by_the_one_that_is_meant(
+    given: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(ROOT)
+    assert cli.main(["bag", "info", given]) == 2
+    assert capsys.readouterr().err.endswith(f"{given}: no such recording; did you mean 'bags/tpose_wave'?\n")
 
 
 TAKEN = (

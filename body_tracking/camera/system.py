@@ -107,10 +107,13 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
 
 def _instead(topic: str, topics: Collection[str]) -> str:
     """What a recording has in place of a camera's topic, for an error."""
+    camera = topic.split("/")[1]
+    own = sorted(each for each in topics if each.startswith(f"/{camera}/"))
     if any(each.startswith(f"{topic}/compressed") for each in topics):
-        camera = topic.split("/")[1]
         depth = any(each.startswith(f"/{camera}/") and each.endswith(COMPRESSED_DEPTH) for each in topics)
         return f" (it comes compressed: --compressed {'both' if depth else 'colour'})"
+    if own:
+        return f"; of {camera} it has {', '.join(own)}"
     cameras = sorted({each.split("/")[1] for each in topics if each.endswith("/camera_info")})
     return f"; it has the cameras {', '.join(cameras)}" if cameras else "; it has no camera"
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NoReturn
 
 from body_tracking.core.errors import did_you_mean
@@ -10,6 +12,11 @@ from body_tracking.core.errors import did_you_mean
 
 class Parser(argparse.ArgumentParser):
     """A parser whose errors are one line that names a similar choice and the command's help, instead of its usage."""
+
+    meant: Mapping[str, str] = MappingProxyType({})
+    """Command lines for words that are none of the choices."""
+    about_bag = ""
+    """What to do with a recording, in a command that takes none."""
 
     def error(self, message: str) -> NoReturn:
         """Exit with code 2."""
@@ -19,14 +26,24 @@ class Parser(argparse.ArgumentParser):
         """As the base class; exits for an unknown argument, which argparse would leave to the outermost parser."""
         found, unknown = super().parse_known_args(args, namespace)
         if unknown:
-            hint = did_you_mean(unknown[0], self._option_string_actions)
-            if "--bag" in self._option_string_actions and not unknown[0].startswith("-"):
-                hint = f"; did you mean '--bag {unknown[0]}'?"
-            self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{self._hint(unknown[0])}")
         return found, unknown
+
+    def _hint(self, unknown: str) -> str:
+        """What may be meant by an unknown argument."""
+        bare, bag = not unknown.startswith("-"), unknown.partition("=")[0] == "--bag"
+        if bare and "--bag" in self._option_string_actions:
+            return f"; did you mean '--bag {unknown}'?"
+        if (bare or bag) and self.about_bag:
+            return f"; {self.about_bag}"
+        if bag and any(action.dest == "bag" for action in self._get_positional_actions()):
+            return "; the recording stands here without '--bag'"
+        return did_you_mean(unknown, self._option_string_actions)
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         """As the base class; Python 3.14 names a similar choice itself, where asked to."""
+        if action.choices is not None and value in self.meant:
+            raise argparse.ArgumentError(action, f"invalid choice: {value!r}; did you mean {self.meant[value]!r}?")
         if action.choices is not None and value not in action.choices and (hint := did_you_mean(value, action.choices)):
             raise argparse.ArgumentError(action, f"invalid choice: {value!r}{hint}")
         super()._check_value(action, value)

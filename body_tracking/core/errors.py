@@ -13,8 +13,9 @@ class BodyTrackingError(Exception):
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
     """``; did you mean 'x'?`` with the most similar known name; empty where none is similar."""
-    similar = get_close_matches(str(name), map(str, known), n=1)
-    return f"; did you mean {similar[0]!r}?" if similar else ""
+    by_letters = {str(each).casefold(): str(each) for each in known}
+    similar = get_close_matches(str(name).casefold(), by_letters, n=1)
+    return f"; did you mean {by_letters[similar[0]]!r}?" if similar else ""
 
 
 def one_of(name: object, known: Collection[str]) -> str:

@@ -64,7 +64,7 @@ SYSTEM = System(
             (),
             "a segment with an inertial sensor, and the sensor's name in its topics if it is not the segment's: "
             "pelvis, lower_trunk, upper_trunk, head, or clavicle, upper_arm, forearm, hand with _left or _right; "
-            "may be repeated",
+            "may be repeated, or a list: A,B",
             "SEGMENT[:NAME]",
             parameter=("imu_skeleton", "segments"),
             example=graph.EXAMPLE_IMUS,

@@ -93,7 +93,10 @@ def sources_in(folder: Path) -> tuple[tuple[str, ...], ...]:
         SetupError: no such folder, or as :func:`camera_names`.
     """
     if not folder.expanduser().is_dir():
-        raise SetupError(f"{folder}: no such folder")
+        reason = "a file, expected its folder" if folder.expanduser().exists() else "no such folder"
+        raise SetupError(f"{folder}: {reason}")
+    if not any((folder.expanduser() / each).is_file() for each in (RIG, TARGETS)):
+        raise SetupError(f"{folder}: holds neither {RIG} nor {TARGETS}, so it is no marker setup")
     if not (folder.expanduser() / RIG).is_file():
         return ((POINTS,),)
     return sources(camera_names(folder))

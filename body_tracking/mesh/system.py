@@ -73,7 +73,11 @@ def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
     wanted = tuple(topic(camera) for camera in _cameras(options) for topic in (info_topic, depth_topic))
     for topic in wanted:
         if topic not in topics:
-            raise graph.GraphError(f"no topic {topic}")
+            there = sorted(
+                camera for camera in {each.split("/")[1] for each in topics} if depth_topic(camera) in topics
+            )
+            hint = f"; its depth cameras are {', '.join(there)}" if there else ""
+            raise graph.GraphError(f"no topic {topic}{hint}")
     return (*wanted, *(topic for topic in map(body_index_topic, _cameras(options)) if topic in topics))
 
 

@@ -16,6 +16,7 @@ import time
 from bisect import bisect_left
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
 from types import TracebackType
@@ -259,7 +260,7 @@ class BagReader:
 
     def _paths(self) -> list[Path]:
         if not self.path.exists():
-            raise BagError(f"{self.path}: no such recording")
+            raise BagError(f"{self.path}: no such recording{_similar(self.path)}")
         if not self.path.is_dir():
             return [self.path]
         found = _files(self.path)
@@ -349,6 +350,14 @@ def _natural(path: Path) -> tuple[str, int]:
     """Sort key with ``name_10`` after ``name_9``."""
     match = re.fullmatch(r"(.*?)_?(\d+)", path.stem)
     return (match[1], int(match[2])) if match else (path.stem, -1)
+
+
+def _similar(path: Path) -> str:
+    """A hint to a recording with a similar name, beside the path or in a folder ``bags``; empty where there is none."""
+    files = [each for folder in (path.parent, path.parent / "bags") for each in folder.glob("*/*.mcap")]
+    known = {each.parent.name: each.parent for each in files}
+    similar = get_close_matches(path.name, known, n=1)
+    return f"; did you mean '{known[similar[0]]}'?" if similar else ""
 
 
 def _files(folder: Path) -> list[Path]:

@@ -17,6 +17,7 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from body_tracking.core import names
+from body_tracking.core.arguments import Parser
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.extras import pip_install
 from body_tracking.core.parameters import Value
@@ -49,6 +50,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "there runs as with body_tracking up, and the page shows it; graph: end leads back to the list. Ctrl-C ends.",
         epilog="The options hold for all that is started from the page.",
     )
+    if isinstance(parser, Parser):
+        parser.about_bag = "the page lists the recordings; `body_tracking up --bag BAG --viewer` shows one at once"
     add_options(parser, *(name for name, each in OPTIONS.items() if not each.hidden and name not in _NOT_HERE))
     parser.add_argument("--log-dir", type=Path, metavar="FOLDER", help="folder for logs (default: that of ROS)")
     parser.set_defaults(run=run)

@@ -341,6 +341,7 @@ def test_a_recording_without_skeletons_is_refused_with_the_options_for_it(tmp_pa
 def test_a_sensor_that_a_recording_lacks_is_refused_with_those_that_it_has(tmp_path: Path, command: Command) -> None:
     """Not with all its topics; an inertial sensor in the form of the option ``--imus``."""
     five, coloured, out = BAG.with_name("five_systems"), BAG.with_name("camera_reaching"), ("-o", tmp_path / "out")
+    turning = BAG.with_name("cameras_turning")
     worn = "forearm_left, forearm_right, pelvis, upper_arm_left, upper_arm_right, upper_trunk"
     for words, said in (
         (("replay", five, *out, "--sensors", "kinect1,kinect9"), "kinect9/skeleton; its sensors are kinect1, kinect2"),
@@ -351,6 +352,12 @@ def test_a_sensor_that_a_recording_lacks_is_refused_with_those_that_it_has(tmp_p
         (("replay", coloured, *out, "--camera", "cam1"), "/cam1/color/camera_info; it has the cameras camera1"),
         (("replay", coloured, *out, "--camera", "camera1"), "(it comes compressed: --compressed colour)"),
         (("replay", BAG, *out, "--camera", "camera1"), "/camera1/color/camera_info; it has no camera"),
+        (
+            ("replay", turning, *out, "--camera", "camera1"),
+            "/camera1/color/camera_info; of camera1 it has /camera1/color/image_raw/compressed",
+        ),
+        (("replay", five, *out, "--depth", "camera9"), "camera_info; its depth cameras are camera1, kinect1"),
+        (("replay", five, *out, "--imus", "pelvis,hand_left"), f"for hand_left; its inertial sensors are {worn}"),
     ):
         code, _, error = command(*words)
         assert code == 2 and error.count("\n") == 1
@@ -600,6 +607,8 @@ def test_sensors_none_leaves_out_the_skeletons_of_a_bag(tmp_path: Path, command:
     for more, message in (
         ((), "no sensors"),
         (("--marker-setup", "nowhere"), "nowhere: no such folder"),
+        (("--marker-setup", setup / "rig.yaml"), "rig.yaml: a file, expected its folder"),
+        (("--marker-setup", setup.parent), "config: holds neither rig.yaml nor targets.yaml, so it is no marker setup"),
         (("--marker-setup", setup), "no topic /left/image_raw or /left/balls or /markers/points"),
     ):
         code, _, reported = command("replay", BAG, "-o", tmp_path / "out", "--sensors", "none", *more)
