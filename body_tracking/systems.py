@@ -146,7 +146,7 @@ def options_from(args: argparse.Namespace) -> dict[str, Value]:
             if not value:
                 raise graph.GraphError("sensors: no name")
         elif isinstance(option.default, tuple):
-            value = [part for each in value for part in each.split(",") if part]
+            value = tuple(part for each in value for part in each.split(",") if part)
         found[name] = tuple(value) if isinstance(option.default, tuple) else str(value) if option.path else value
     return found
 
