@@ -389,7 +389,8 @@ class GraphNode(BatchNode):
         name = self.resolve_topic_name(topic) if absolute else self.full_name(topic)
 
         def callback(message: Any, info: dict[str, int]) -> None:
-            self.sequences.note(name, info["publication_sequence_number"])
+            if topic != graph.DIAGNOSTICS_TOPIC:  # each node publishes there, and the numbers do not say which
+                self.sequences.note(name, info["publication_sequence_number"])
             self.monitor.arrived(name)
             self._arrived(info)
             handle(message, info["source_timestamp"])

@@ -18,6 +18,7 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from running import BAG, RELIABLE, ROOT, Running, environment, stop  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 from simulated_arm import SimulatedArm  # noqa: E402
@@ -437,3 +438,18 @@ def test_an_arm_follows_two_sensors_through_the_whole_graph_and_holds_when_they_
     assert len(after) > last + 1
     held_up = stall([killed, *[came for came, _, _ in after[: last + 2]]])
     assert after[last][0] - killed <= silence + held_up
+
+
+def test_the_diagnostics_of_many_nodes_are_not_taken_for_lost_messages(tmp_path: Path) -> None:
+    """Sequence numbers do not say of which of a topic's publishers they are."""
+    with Running(tmp_path) as running:
+        running.start("robot_commands", mapping=mapping_file("two_joint_arm"))
+        nodes = [running.node.create_publisher(DiagnosticArray, graph.DIAGNOSTICS_TOPIC, 10) for _ in range(8)]
+        assert running.until(lambda: all(each.get_subscription_count() > 1 for each in nodes))
+        for _ in range(20):
+            for number, each in enumerate(nodes):
+                for _ in range(1 + number):
+                    each.publish(DiagnosticArray())
+            running.until(lambda: False, timeout=0.02)
+        assert running.until(lambda: running.number("robot_commands", "received") > 300)
+        assert f"lost {graph.DIAGNOSTICS_TOPIC}" not in running.said("robot_commands")
