@@ -45,6 +45,8 @@ def test_problems_are_named_by_their_nodes(tmp_path: Path) -> None:
     assert monitor.summary(options, 3.0, {}) == "played arm in 3.0 s (start and end included): 7 frames of joint angles"
     stopped = monitor.summary(options, 3.0, {}, played=False)
     assert stopped == "stopped before the end of arm, after 3.0 s (start included): 7 frames of joint angles"
+    found["bag_player"] = NodeStatus("", 0, "at the end", {"position s": "15.4", "duration s": "15.4"})
+    assert monitor.summary(options, 3.0, {}, played=False).startswith("played arm in 3.0 s")  # it stays at its end
     options["record"] = str(tmp_path / "session")
     assert monitor.summary(options, 3.0, {}).endswith(", nothing was recorded")  # the first message makes it
     (tmp_path / "session").mkdir()
@@ -96,7 +98,7 @@ def test_a_bag_that_waits_names_the_nodes_that_it_waits_for() -> None:
     monitor = monitor_without_node()
     assert not monitor.has_subscribers({}, ["fusion", "joint_angles"])
     line = monitor.line(options_of(sensors=("kinect1",), bag="arm"), 1.0, {})
-    assert line.strip() == "1.0 s (the bag plays once all nodes have started: fusion, joint_angles)"
+    assert line.strip() == "1.0 s (the bag plays once these nodes have started: fusion, joint_angles)"
 
 
 def test_a_narrow_terminal_shows_the_whole_status_over_several_lines(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -154,6 +156,15 @@ def test_the_recorder_rightly_waits_for_a_bag_that_has_not_begun() -> None:
     monitor._statuses["bag_player"] = NodeStatus("", 0, "playing", {"position s": "0.4"}, received=time.monotonic())
     monitor._statuses["bag_recorder"] = NodeStatus("", 1, waiting, received=time.monotonic())
     assert "bag_recorder" not in monitor.line(with_bag, 1.0, {})
+
+
+def test_joint_angles_rightly_wait_for_a_filter_that_starts() -> None:
+    monitor = monitor_without_node()
+    waiting = NodeStatus("joint_angles: state", 1, "no filter publishes anything", received=time.monotonic())
+    monitor._statuses = {"joint_angles": waiting}
+    options = options_of(sensors=("kinect1",), external=True)
+    assert "no filter" not in monitor.line(options, 5.0, {})
+    assert "joint_angles: no filter publishes anything" in monitor.line(options, 20.0, {})
 
 
 def test_a_recording_that_the_page_began_is_named_at_the_end() -> None:

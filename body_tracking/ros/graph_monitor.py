@@ -46,6 +46,8 @@ _FRESH = 3.0
 """Seconds for which a node's diagnostics are valid."""
 _RECENT_S = 5.0
 """Seconds: the status line names the messages that were not processed in these last ones."""
+_END_S = 0.05
+"""Seconds before the end of a bag that count as its end."""
 _SILENT_S = 10.0
 """Seconds without a bag after which a sensor that has never sent is named."""
 
@@ -57,16 +59,15 @@ def calibration_part(status: NodeStatus | None, sensors: Collection[str]) -> lis
     return [f"calibration: {status.text if status is not None else 'none'}"]
 
 
-def problem_parts(statuses: Mapping[str, NodeStatus], *, bag_starts: bool = False) -> list[str]:
+def problem_parts(statuses: Mapping[str, NodeStatus], waiting: Collection[str] = ()) -> list[str]:
     """The problems that nodes report, with their names; not those of nodes that have a part of their own.
 
     Args:
         statuses: by node.
-        bag_starts: a bag is to be played and has hardly begun: the recorder rightly waits for its clock.
+        waiting: nodes that rightly wait for others, and whose warnings are left out.
     """
-    bad = {name: each.text for name, each in statuses.items() if each.level and each.text and name not in _OWN_PART}
-    if bag_starts and "bag_recorder" in bad and statuses["bag_recorder"].level == 1:
-        del bad["bag_recorder"]
+    left_out = {*_OWN_PART, *(name for name in waiting if name in statuses and statuses[name].level == 1)}
+    bad = {name: each.text for name, each in statuses.items() if each.level and each.text and name not in left_out}
     return [f"{name}: {text}" for name, text in sorted(bad.items())]
 
 
@@ -208,8 +209,10 @@ class GraphMonitor:
         starts = bool(options["bag"]) and (not self.clock_ns or (player is not None and position < _REPORTED_S))
         parts = [f"{elapsed:6.1f} s"]
         if starts and not position and not self.angles:
-            wait = f": {', '.join(self._awaited)}" if self._awaited else ""
-            parts[0] += f" (the bag plays once all nodes have started{wait})"
+            which = (
+                f"these nodes have started: {', '.join(self._awaited)}" if self._awaited else "all nodes have started"
+            )
+            parts[0] += f" (the bag plays once {which})"
         else:
             if player is not None:
                 parts[0] += f" (bag {position:.1f}/{player.number('duration s') or 0.0:.1f} s)"
@@ -223,7 +226,9 @@ class GraphMonitor:
             if not options["bag"] and elapsed > _SILENT_S:
                 parts += self._silent_sensors(options, fresh)
         if not self.angles:
-            parts += problem_parts(fresh, bag_starts=starts)
+            early = starts or elapsed < _SILENT_S
+            # the recorder waits for the bag's clock, and the filter may not have started
+            parts += problem_parts(fresh, ("bag_recorder",) * starts + ("joint_angles",) * early)
         malformed = sum(int(status.values.get("malformed", 0)) for status in fresh.values())
         if malformed:
             parts.append(f"malformed {malformed}")
@@ -292,6 +297,9 @@ class GraphMonitor:
         """The last line of a run; ``played`` says whether a bag came to its end."""
         seconds = f"{elapsed:.1f} s"
         what = f"ran for {seconds}"
+        player = self._statuses.get("bag_player")
+        if player is not None and (duration := player.number("duration s")):  # it may wait there, for the page
+            played |= (player.number("position s") or 0.0) >= duration - _END_S
         if options["bag"] and played:
             what = f"played {options['bag']} in {seconds} (start and end included)"
         elif options["bag"]:
