@@ -109,7 +109,11 @@ def add_options(parser: argparse.ArgumentParser, *names: str, **texts: str) -> N
         texts: help texts that replace those of the options.
     """
     groups: dict[str, argparse._ArgumentGroup] = {}
-    for system, option in [(each, option) for each in SYSTEMS for option in each.options]:
+    # what everybody tries first comes first: a recording to play
+    systems = (
+        SYSTEMS if names else sorted(SYSTEMS, key=lambda each: all(option.name != "bag" for option in each.options))
+    )
+    for system, option in [(each, option) for each in systems for option in each.options]:
         if option.hidden or (names and option.name not in names):
             continue
         if system.heading not in groups:

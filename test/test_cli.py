@@ -150,6 +150,14 @@ def test_a_mistyped_recording_is_answered_by_the_one_that_is_meant(
     assert capsys.readouterr().err.endswith(f"{given}: no such recording; did you mean 'bags/tpose_wave'?\n")
 
 
+def test_a_recording_to_play_is_the_first_option_of_up(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["up", "--help"])
+    usage = capsys.readouterr().out
+    assert usage.index("[--bag BAG]") < usage.index("[--sensors")
+    assert usage.index("playing and recording:") < usage.index("skeletons, calibration and people:")
+
+
 TAKEN = (
     ("calibrate nowhere -o taken.yaml", "taken.yaml"),
     ("evaluate nowhere --save-mountings taken.yaml", "taken.yaml"),
