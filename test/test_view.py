@@ -46,7 +46,12 @@ def written(folder: Path, topics: dict[str, str]) -> Path:
 def test_other_sensors_of_a_recording_are_named() -> None:
     content = described(BAGS / "five_systems").content
     assert "sensors kinect1, kinect2; also in it, for " in content
-    for each in ("--imus: forearm_left", "--marker-setup: left, right", "--marker-setup: camera1, kinect1"):
+    for each in (
+        "--imus: forearm_left",
+        "--marker-setup: left, right",
+        "--camera, --camera-rig or --depth: camera1",
+        "--depth: kinect1",
+    ):
         assert each in content
     assert described(BAGS / "tpose_wave").content == "15.4 s, sensors kinect1, kinect2"
 

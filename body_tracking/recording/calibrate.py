@@ -159,6 +159,5 @@ def run(args: argparse.Namespace) -> int:
     print(f"{verdict}{quality(status)} (good is below {limits})")
     if status.level:
         print(f"next: record again, and {next_step(status)}")
-    if args.output is not None:
-        print(f"saved to {args.output}")
+    print(f"saved to {args.output}" if args.output is not None else "not saved: -o FILE saves it")
     return 0

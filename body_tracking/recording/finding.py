@@ -23,6 +23,8 @@ SETUPS: Final[Mapping[str, Mapping[str, Value]]] = {
 """Options of ``up`` for those shipped recordings whose topics do not determine them."""
 
 _CAMERAS: Final = ("--camera", "--camera-rig", "--depth", "--marker-setup")
+_COLOUR, _DEPTH = ("color", "colour", "rgb"), ("depth", "stereo")
+"""Words in the names of the topics of drivers."""
 _BALLS: Final = "/balls"
 _ESTIMATED: Final = ("/imu/", "/humans/")
 """Topics of what the graph estimates, of the same types as those of sensors."""
@@ -46,6 +48,12 @@ def _takers(topics: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
     """The options that take each topic that is no skeleton, given the topics' types."""
     found = {name: options_for_topic(name, type_name) for name, type_name in topics.items()}
     found = {name: options for name, options in found.items() if options}
+    for source in {name.split("/")[1] for name, options in found.items() if options == _CAMERAS}:
+        own = [name for name, options in found.items() if name.startswith(f"/{source}/") and options == _CAMERAS]
+        colour, depth = (any(word in name for name in own for word in words) for words in (_COLOUR, _DEPTH))
+        if colour or depth:
+            options = ("--camera",) * (colour and depth) + ("--camera-rig",) * colour + ("--depth",) * depth
+            found |= dict.fromkeys(own, options)
     for camera in (name.removesuffix(_BALLS) for name in topics if name.endswith(_BALLS)):
         # its images are of the infrared camera that sees the balls
         found |= {name: ("--marker-setup",) for name in found if name.startswith(f"{camera}/")}

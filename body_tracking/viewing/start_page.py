@@ -18,6 +18,8 @@ DEFAULT: Final = "default"
 _RUNS: Final = "A graph of <code>body_tracking up</code> runs already; end it before you start another one here."
 _LEFT, _RIGHT = 540, 380
 """Widths of the panels, pixels: both fit a tablet of 1024."""
+_LAST: Final = 1e6
+"""Place in the panel behind all recordings."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,12 +97,17 @@ class StartPage:
             self._sensors = gui.add_html("")
             self._start: Any = gui.add_button("start with these sensors", visible=False)
         with gui.add_folder("How"):
-            self._filter: Any = gui.add_dropdown("filter", (DEFAULT, *filters), initial_value=before.filter)
+            self._filter: Any = gui.add_dropdown(
+                "filter",
+                (DEFAULT, *filters),
+                initial_value=before.filter,
+                hint="default: lkf_constant_velocity, or ekf where all sensors are colour cameras or inertial ones",
+            )
             self._convention: Any = gui.add_dropdown(
                 "angles",
                 (DEFAULT, *conventions),
                 initial_value=before.convention,
-                hint="isb suits arms raised sideways",
+                hint="default: those of the filter; isb suits arms raised sideways",
             )
             self._loop: Any = gui.add_checkbox("loop", before.loop, hint="play the recording again at its end")
         with gui.add_folder("Nodes"):
@@ -109,8 +116,12 @@ class StartPage:
         panel = gui.add_panel()
         self._recordings = panel.add_tab("Recordings", viser.Icon.PLAYER_PLAY)
         with self._recordings:
-            self._path: Any = gui.add_text("open", "", hint="a recording elsewhere: its folder, or its mcap file")
-            self._open: Any = gui.add_button("open this recording")
+            # below the list, of which it is the last entry
+            where = "<b>a recording elsewhere</b>: the path of its folder, or of its mcap file"
+            gui.add_divider(order=_LAST)
+            gui.add_html(block([where]), order=_LAST + 1)
+            self._path: Any = gui.add_text("path", "", order=_LAST + 2)
+            self._open: Any = gui.add_button("play the recording at this path", order=_LAST + 3)
         self._open.on_click(lambda _: self._on_open())
         self._listed: tuple[Recording, ...] = ()
         self._parts: list[Any] = []

@@ -95,10 +95,10 @@ def test_from_the_start_page_to_a_recording_and_back(start_page: Browser) -> Non
     browser.reads("play markers_arm")
     at_both_sizes(browser)
     browser.save("viewer_start.png")
-    field = page.locator("xpath=//label[.='open']/following::input[1]")
+    field = page.locator("xpath=//label[.='path']/following::input[1]")
     field.fill("nowhere")
     field.press("Enter")
-    browser.press("open this recording")
+    browser.press("play the recording at this path")
     browser.reads("failed.*nowhere")
 
     page.get_by_label("loop").dispatch_event("click")

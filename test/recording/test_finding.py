@@ -17,23 +17,32 @@ FIVE = {
     "/ground_truth/joint_states": JOINT_STATE,
     "/ground_truth/skeleton": POINT_CLOUD,
 }
-IMAGES = "--camera, --camera-rig, --depth or --marker-setup"
+IMAGES = "--camera, --camera-rig or --depth"
 MARKERS = {"/left/balls": POINT_CLOUD, "/right/balls": POINT_CLOUD, "/markers/points": POINT_CLOUD}
 
 
 @pytest.mark.parametrize(
     ("options", "left"),
     [
-        ({"sensors": ("kinect1",)}, f"{IMAGES}: camera1, kinect1; --imus: pelvis; --marker-setup: left"),
+        ({"sensors": ("kinect1",)}, f"--depth: kinect1; {IMAGES}: camera1; --imus: pelvis; --marker-setup: left"),
         (
             {"sensors": ("kinect1",), "depth": ("kinect1",), "imus": ("upper_trunk:pelvis",)},
             f"{IMAGES}: camera1; --marker-setup: left",
         ),
-        ({"sensors": ("kinect1",), "camera": ("camera1",), "marker_setup": "lab"}, "--imus: pelvis"),
+        ({"sensors": ("kinect1",), "camera": ("camera1",), "marker_setup": "lab"}, "--depth: kinect1; --imus: pelvis"),
+        ({"sensors": ("kinect1",), "camera_rig": "rig"}, "--depth: kinect1; --imus: pelvis; --marker-setup: left"),
     ],
 )
 def test_sources_that_a_graph_leaves_out_are_named(options: dict[str, str | tuple[str, ...]], left: str) -> None:
     assert unused(FIVE, options) == left
+
+
+def test_only_options_that_fit_the_images_are_advised() -> None:
+    turning = {f"/camera{number}/color/image_raw/compressed": COMPRESSED_IMAGE for number in (1, 2)}
+    assert advice_for(turning).endswith("the option that takes them: --camera-rig FOLDER")
+    assert advice_for({"/kinect1/depth/image_raw": IMAGE}).endswith("the option that takes them: --depth SENSOR")
+    everything = "--camera SENSOR, --camera-rig FOLDER, --depth SENSOR or --marker-setup FOLDER"
+    assert advice_for({"/left/image_raw": IMAGE}).endswith(everything)
 
 
 def test_estimates_are_no_sources() -> None:
