@@ -63,8 +63,9 @@ def calibrated(
     ``drift_ppm``: standard deviation of the clocks' drifts.
     """
     own = {name: ClockModel() for name in poses} | dict(clocks or {})
-    quality = {name: SensorQuality(0.03, 0.005, 0.01, 0.002, 500, drift_ppm) for name in poses}
-    save(CalibrationResult(next(iter(poses)), dict(poses), own, quality), file)
+    stated = {name: replace(clock, stddev=0.002, drift_stddev_ppm=drift_ppm) for name, clock in own.items()}
+    quality = {name: SensorQuality(0.03, 0.005, 0.01, 500) for name in poses}
+    save(CalibrationResult(next(iter(poses)), dict(poses), stated, quality), file)
     return str(file)
 
 

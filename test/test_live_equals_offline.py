@@ -11,6 +11,7 @@ import shutil
 import signal
 import struct
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -289,8 +290,8 @@ def two_people(folder: Path) -> tuple[Path, Path]:
     )
     write_bag(recording, folder / "people")
     poses = {sensor.pose.sensor: sensor.pose for sensor in recording.sensors}
-    clocks = {sensor.pose.sensor: sensor.clock for sensor in recording.sensors}
-    quality = {name: SensorQuality(0.03, 0.005, 0.01, 0.002, 500) for name in poses}
+    clocks = {sensor.pose.sensor: replace(sensor.clock, stddev=0.002) for sensor in recording.sensors}
+    quality = {name: SensorQuality(0.03, 0.005, 0.01, 500) for name in poses}
     save(CalibrationResult("kinect1", poses, clocks, quality), folder / "true.yaml")
     return folder / "people", folder / "true.yaml"
 

@@ -598,7 +598,7 @@ class OnlineCalibration:
                     f"{np.degrees(apart):.1f} deg away; estimated anew"
                 )
         other.estimated = True
-        other.quality = SensorQuality(best.residual, best.rotation_stddev, best.translation_stddev, frames=len(pairs))
+        other.quality = SensorQuality(best.residual, best.rotation_stddev, best.translation_stddev, len(pairs))
         self._set_target(other, best.rotation, best.translation, best.centre)
 
     @staticmethod
@@ -668,7 +668,7 @@ class OnlineCalibration:
         base_rotation = self._base.rotation
         poses = {self.reference: replace(self._base, valid_from_ns=valid_from_ns)}
         clocks = {self.reference: ClockModel(0, 0.0, self._anchor or 0, 0.0, 0.0)}
-        quality = {self.reference: SensorQuality(0.0, 0.0, 0.0, 0.0, 0, 0.0)}
+        quality = {self.reference: SensorQuality(0.0, 0.0, 0.0)}
         for name, other in self._sensors.items():
             if other.rotation is None or other.target is None:
                 continue
@@ -680,9 +680,7 @@ class OnlineCalibration:
                 valid_from_ns,
             )
             clocks[name] = other.clock
-            quality[name] = replace(
-                other.quality, clock_stddev=other.clock.stddev, clock_drift_stddev_ppm=other.clock.drift_stddev_ppm
-            )
+            quality[name] = other.quality
         return CalibrationResult(self.reference, poses, clocks, quality)
 
     def current_update(self) -> CalibrationUpdate:
@@ -736,15 +734,13 @@ class OnlineCalibration:
             other.rotation, other.translation = rotation, translation
             other.target = rotation, translation, translation
             other.quality = result.quality.get(name, SensorQuality())
-            drift_stddev_ppm = min(other.quality.clock_drift_stddev_ppm, 1e6 * DRIFT_PRIOR)
             clock = result.clocks.get(name, ClockModel())
             if abs(clock.offset) > FOREIGN_CLOCK:
                 self.events.append(f"{name}: its saved clock is {clock.offset:+.1f} s off, not in ROS time: left out")
                 other.clock = other.loaded = ClockModel(drift_stddev_ppm=1e6 * DRIFT_PRIOR)
             else:
-                other.clock = other.loaded = replace(
-                    clock, stddev=other.quality.clock_stddev, drift_stddev_ppm=drift_stddev_ppm
-                )
+                drift_stddev_ppm = min(clock.drift_stddev_ppm, 1e6 * DRIFT_PRIOR)
+                other.clock = other.loaded = replace(clock, drift_stddev_ppm=drift_stddev_ppm)
 
     # --- services
 

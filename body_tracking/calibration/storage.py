@@ -43,8 +43,8 @@ def to_dict(result: CalibrationResult) -> dict[str, Any]:
                 "residual_mm": known(result.quality[name].residual, 1e3),
                 "rotation_stddev_deg": known(result.quality[name].rotation_stddev, 180.0 / np.pi),
                 "translation_stddev_mm": known(result.quality[name].translation_stddev, 1e3),
-                "clock_stddev_ms": known(result.quality[name].clock_stddev, 1e3),
-                "clock_drift_stddev_ppm": known(result.quality[name].clock_drift_stddev_ppm),
+                "clock_stddev_ms": known(result.clocks[name].stddev, 1e3),
+                "clock_drift_stddev_ppm": known(result.clocks[name].drift_stddev_ppm),
                 "frames": result.quality[name].frames,
             }
             for name, pose in result.poses.items()
@@ -82,7 +82,7 @@ def _sensor(name: str, entry: dict[str, Any]) -> tuple[SensorPose, ClockModel, S
     if (np.abs(translation) > MAX_RANGE).any():
         raise ValueError(f"translation {translation}, expected at most {MAX_RANGE:g} m")
 
-    def quality(key: str, scale: float, unknown: float) -> float:
+    def stated(key: str, scale: float, unknown: float) -> float:
         return unknown if entry.get(key) is None else float(entry[key]) / scale
 
     def bounded(key: str, limit: float) -> float:
@@ -97,14 +97,14 @@ def _sensor(name: str, entry: dict[str, Any]) -> tuple[SensorPose, ClockModel, S
             round(bounded("clock_offset_s", MAX_STAMP_NS / NANOSECONDS) * NANOSECONDS),
             bounded("clock_drift_ppm", MAX_DRIFT_PPM),
             int(bounded("clock_anchor_ns", MAX_STAMP_NS) and entry["clock_anchor_ns"]),
+            stated("clock_stddev_ms", 1e3, float("inf")),
+            stated("clock_drift_stddev_ppm", 1.0, float("inf")),
         ),
         SensorQuality(
-            quality("residual_mm", 1e3, float("nan")),
-            quality("rotation_stddev_deg", 180.0 / np.pi, float("inf")),
-            quality("translation_stddev_mm", 1e3, float("inf")),
-            quality("clock_stddev_ms", 1e3, float("inf")),
+            stated("residual_mm", 1e3, float("nan")),
+            stated("rotation_stddev_deg", 180.0 / np.pi, float("inf")),
+            stated("translation_stddev_mm", 1e3, float("inf")),
             int(entry.get("frames", 0)),
-            quality("clock_drift_stddev_ppm", 1.0, float("inf")),
         ),
     )
 

@@ -54,23 +54,19 @@ def level_pose(sensor: str, height: float = 0.0, pitch: float = 0.0, roll: float
 
 @dataclass(frozen=True, slots=True)
 class SensorQuality:
-    """How well one sensor's calibration is known.
+    """How well the pose of one sensor is known.
 
     Attributes:
         residual: median distance between both sensors' positions of a joint, metres; NaN before any overlap.
         rotation_stddev: radians; infinity while unknown.
         translation_stddev: metres, at the place of the person; infinity while unknown.
-        clock_stddev: of the clock's offset at its anchor, seconds; infinity while unknown.
         frames: pairs of frames that the estimate is made of.
-        clock_drift_stddev_ppm: of the clock's drift, parts per million; infinity while unknown.
     """
 
     residual: float = float("nan")
     rotation_stddev: float = float("inf")
     translation_stddev: float = float("inf")
-    clock_stddev: float = float("inf")
     frames: int = 0
-    clock_drift_stddev_ppm: float = float("inf")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,8 +76,8 @@ class CalibrationResult:
     Attributes:
         reference: the sensor that defines ``world`` and its time.
         poses: a pose per calibrated sensor; a sensor that is not calibrated yet is absent.
-        clocks: the clock of each sensor in ``poses``.
-        quality: of each sensor in ``poses``.
+        clocks: the clock of each sensor in ``poses``, with its standard deviations.
+        quality: of the pose of each sensor in ``poses``.
     """
 
     reference: str

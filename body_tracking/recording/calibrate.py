@@ -151,7 +151,7 @@ def run(args: argparse.Namespace) -> int:
         print(
             f"{name}: at ({x:.3f}, {y:.3f}, {z:.3f}) m in world, yaw {np.degrees(relative_yaw(result, name)):.2f} deg "
             f"(+-{np.degrees(stated.rotation_stddev):.2f}), "
-            f"clock {clock.offset:+.4f} s (+-{stated.clock_stddev:.4f}), "
+            f"clock {clock.offset:+.4f} s (+-{clock.stddev:.4f}), "
             f"drift {clock.drift_ppm:+.0f} ppm, {of_what} residual {1e3 * stated.residual:.0f} mm"
         )
     limits = f"{np.degrees(parameters.max_rotation_stddev):.1f} degrees and {1e3 * MAX_TRANSLATION_STDDEV:.0f} mm"

@@ -219,7 +219,7 @@ def test_a_still_pose_starts_and_movement_refines() -> None:
     assert updates[0].valid_from_ns < 5 * NANOSECONDS
     result = calibration.finish()
     assert yaw_error(result) < 0.5
-    clock_stddev = result.quality["kinect2"].clock_stddev
+    clock_stddev = result.clocks["kinect2"].stddev
     assert clock_stddev < 0.03
     assert result.clocks["kinect2"].offset == pytest.approx(0.4, abs=3 * clock_stddev)
     level, line, values = calibration.status()
@@ -309,7 +309,7 @@ def test_without_motion_times_of_receipt_give_the_clock() -> None:
         )
         result = run(tuple(sorted(burst, key=lambda each: each[2])))[0].result()
         assert result.clocks["kinect2"].offset == pytest.approx(0.45, abs=0.0201)
-        assert result.quality["kinect2"].clock_stddev == 0.05
+        assert result.clocks["kinect2"].stddev == 0.05
 
 
 def test_neither_a_still_pose_nor_motion_that_determines_the_clock_is_needed() -> None:
@@ -388,14 +388,17 @@ def test_a_saved_clock_is_known_better_than_from_motion_that_looks_different_fro
         """The error of the clock at the end, and its stated standard deviation."""
         calibration = OnlineCalibration(names)
         if saved is not None:
-            quality = SensorQuality(0.03, 0.005, 0.01, 0.002, 500, drift_stddev_ppm)
-            saved_clocks = {**clocks, "kinect2": saved}
+            quality = SensorQuality(0.03, 0.005, 0.01, 500)
+            saved_clocks = {
+                name: replace(each, stddev=0.002, drift_stddev_ppm=drift_stddev_ppm)
+                for name, each in {**clocks, "kinect2": saved}.items()
+            }
             calibration.load(CalibrationResult(names[0], poses, saved_clocks, dict.fromkeys(names, quality)))
         for each in recording.frames:
             calibration.push(each.sensor, each.skeletons[0], each.received_ns)
         result = calibration.result()
         apart = result.clocks["kinect2"].to_sensor(last_ns) - true.to_sensor(last_ns)
-        return apart / NANOSECONDS, result.quality["kinect2"].clock_stddev
+        return apart / NANOSECONDS, result.clocks["kinect2"].stddev
 
     error, stddev = off(None)
     assert abs(error) > 0.01
@@ -413,11 +416,11 @@ def test_a_saved_clock_is_known_better_than_from_motion_that_looks_different_fro
 def test_a_clock_that_was_set_since_it_was_saved_is_found_anew(offset: float) -> None:
     """Even by less than the accuracy of the times of receipt."""
     saved = saved_after()
-    saved.quality["kinect2"] = replace(saved.quality["kinect2"], clock_stddev=0.003)
+    saved.clocks["kinect2"] = replace(saved.clocks["kinect2"], stddev=0.003)
     calibration, _ = run(stream(float(draws(25, 40)), offset=offset), saved=saved)
     assert sum("was set since" in event for event in calibration.events) == 1
     result = calibration.result()
-    within = 3.0 * result.quality["kinect2"].clock_stddev
+    within = 3.0 * result.clocks["kinect2"].stddev
     assert result.clocks["kinect2"].offset == pytest.approx(offset, abs=within)
 
 
@@ -429,7 +432,7 @@ def test_a_looping_bag_keeps_the_poses_and_adds_no_information_on_the_clock() ->
     twice = calibration.result()
     assert any("went back" in event for event in calibration.events)
     assert Rotation.from_matrix(between(twice)[0] @ between(once)[0].T).magnitude() < np.radians(0.5)
-    assert twice.quality["kinect2"].clock_stddev == pytest.approx(once.quality["kinect2"].clock_stddev, rel=0.05)
+    assert twice.clocks["kinect2"].stddev == pytest.approx(once.clocks["kinect2"].stddev, rel=0.05)
     assert twice.clocks["kinect2"].offset == pytest.approx(once.clocks["kinect2"].offset, abs=0.001)
 
 
@@ -439,9 +442,9 @@ def test_a_clock_that_drifts_far_is_followed() -> None:
     drift, seconds = 500e-6, 360.0
     calibration, _ = run(stream(seconds, drift=drift))
     for result in (calibration.result(), calibration.finish()):
-        clock, quality = result.clocks["kinect2"], result.quality["kinect2"]
-        assert 1e-6 * clock.drift_ppm == pytest.approx(drift, abs=3e-6 * quality.clock_drift_stddev_ppm)
-        assert quality.clock_drift_stddev_ppm < 60.0
+        clock = result.clocks["kinect2"]
+        assert 1e-6 * clock.drift_ppm == pytest.approx(drift, abs=3e-6 * clock.drift_stddev_ppm)
+        assert clock.drift_stddev_ppm < 60.0
         now_ns = round(seconds * NANOSECONDS)
         off = clock.to_sensor(now_ns) / NANOSECONDS - (seconds * (1.0 + drift) + 0.4)
         assert abs(off) < 0.01

@@ -37,8 +37,8 @@ def test_the_least_certain_sensor_counts() -> None:
         CalibrationResult(
             "a",
             {name: level_pose(name) for name in sensors},
-            {name: ClockModel() for name in sensors},
-            {name: SensorQuality(0.03, deviations[name], 2.0 * deviations[name], 0.001, 100) for name in sensors},
+            {name: ClockModel(stddev=0.001) for name in sensors},
+            {name: SensorQuality(0.03, deviations[name], 2.0 * deviations[name], 100) for name in sensors},
         )
     )
     quality = CalibrationQuality.from_diagnostics(reported(calibration), sensors)
