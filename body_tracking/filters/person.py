@@ -3,28 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 from body_tracking.calibration.kinect_spine import corrected_kinect
-from body_tracking.core.clocks import ClockModel, jumped_back
+from body_tracking.core.clocks import jumped_back
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.orientation import SegmentOrientation
 from body_tracking.core.qos import Qos
-from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import Skeleton
-from body_tracking.filters import (
-    DEFAULT_FILTER,
-    THESIS_FILTERS,
-    ModelFilter,
-    make_filter,
-)
+from body_tracking.filters import THESIS_FILTERS, ModelFilter, SkeletonFilter
 from body_tracking.filters.prediction import Prediction
 from body_tracking.filters.smoothing import FixedLag, SmoothableFilter
 from body_tracking.fusion.alignment import SensorAlignment
 from body_tracking.fusion.ordering import Ordering
-from body_tracking.fusion.people import People
-from body_tracking.fusion.placement import WORLD
 from body_tracking.kinematics.codecs import Segments
 from body_tracking.kinematics.tracking import LengthChanges
 from body_tracking.messages.codecs import (
@@ -35,150 +26,78 @@ from body_tracking.messages.codecs import (
     Text,
 )
 from body_tracking.pipeline import graph
-from body_tracking.pipeline.people import PeopleParameters
-from body_tracking.pipeline.roles import role_of
+from body_tracking.pipeline.shared import names_in, sensors_of
 from body_tracking.pipeline.stage import Port
-
-DEFAULT_PREDICT_AFTER = 0.1
-"""Seconds."""
-
-DEFAULT_ORDER_WAIT = 0.05
-"""Seconds."""
-
-
-@dataclass(frozen=True, slots=True)
-class FilterSettings:
-    """Settings of a :class:`PersonFilter`; the defaults are those of the node.
-
-    Attributes:
-        filter_name: one of ``FILTERS``.
-        parameters: of the filter, without a prefix.
-        input: ``graph.AUTO``, ``graph.FUSED_INPUT`` or ``graph.SENSORS_INPUT``.
-        sensors: for ``graph.SENSORS_INPUT``.
-        reference: for the same input: sensor with the clock of ``world``; empty for the first one.
-        world: for the same input: frame of the output.
-        body: the person's id in topics.
-        predict_after: seconds without a frame after which predicted ones are published.
-        order_wait: greatest time in seconds that a sensor's frame waits for an older one.
-        people: selection of people.
-        lag: seconds by which frames are held back to be smoothed; 0 for none.
-        kinect_v2: whether the skeletons are of a Kinect v2, whose arms and spine have known errors; the thesis's
-            filters do not use it.
-        not_kinects: sensors to which this does not apply. Fused frames are corrected unless all sensors are of these.
-    """
-
-    filter_name: str = DEFAULT_FILTER
-    parameters: Mapping[str, Any] = field(default_factory=dict)
-    input: str = graph.AUTO
-    sensors: Sequence[str] = ()
-    reference: str = ""
-    world: str = WORLD
-    body: str = graph.DEFAULT_BODY
-    predict_after: float = DEFAULT_PREDICT_AFTER
-    order_wait: float = DEFAULT_ORDER_WAIT
-    people: PeopleParameters = field(default_factory=PeopleParameters)
-    kinect_v2: bool = True
-    lag: float = 0.0
-    not_kinects: Sequence[str] = ()
 
 
 class PersonFilter:
     """Feeds the filter of one person and publishes its output.
 
     Args:
-        settings: of the filter.
+        estimator: the filter.
+        values: of the parameters of the stage ``skeleton_filter``.
+        body: the person's id in topics.
         publish: called with topic, payload and capture time.
-        wanted: whether a topic has a subscriber; None: all topics are published.
-        one_of_several: called with the filtered skeletons instead of ``publish``, for one of several people. Then all
-            frames are of this person, whose name is in the topics.
+        wanted: whether a topic has a subscriber.
+        by_sensor: whether it takes sensors' frames instead of fused ones.
+        several: whether this is one of several people, whose ids are in the topics of their models.
 
     Attributes:
-        by_sensor: whether it takes sensors' frames instead of fused ones.
-        alignment: from sensors to world; None with fused frames.
-        models: whether it publishes the state of a model.
+        alignment: from sensors to world; None for fused frames, or without sensors.
+        tracked: whether a fused frame has come since the start or the last jump of time.
 
     Raises:
-        FilterError: unknown filter, or invalid parameters.
-        GraphError: the filter does not take this input, or no lag.
+        GraphError: the filter cannot smooth, and ``lag`` is given.
         FusionError: the reference is not among the sensors.
     """
 
     def __init__(
         self,
-        settings: FilterSettings,
+        estimator: SkeletonFilter,
+        values: Mapping[str, Any],
+        body: str,
         publish: Callable[[str, Any, int], None],
-        wanted: Callable[[str], bool] | None = None,
-        one_of_several: Callable[[Skeleton], None] | None = None,
+        wanted: Callable[[str], bool],
+        *,
+        by_sensor: bool,
+        several: bool,
     ) -> None:
-        self._filter = make_filter(settings.filter_name, **settings.parameters)
-        role = role_of({"filter": settings.filter_name, "filter_input": settings.input})
-        self.by_sensor = role.input == graph.SENSORS_INPUT
+        self._filter = estimator
+        name, sensors = values["filter"], sensors_of(values)
         self.alignment: SensorAlignment | None = None
-        self.people: People | None = None
-        if not settings.sensors and not self.by_sensor:
-            raise graph.GraphError(
-                f"filter {settings.filter_name} needs skeletons; inertial sensors alone need --filter ekf"
-            )
-        if self.by_sensor and settings.sensors:
-            self.alignment = SensorAlignment(settings.sensors, settings.reference or None, settings.world)
-            if one_of_several is None:
-                self.people = People(settings.sensors, settings.people, self.alignment.reference)
-        corrects = settings.kinect_v2 and settings.filter_name not in THESIS_FILTERS
-        self._kinects = set(settings.sensors) - set(settings.not_kinects) if corrects else set()
-        self._corrects_fused = corrects and (bool(self._kinects) or not settings.sensors)
-        self._ordering = Ordering(settings.sensors, settings.order_wait)
-        self._model_filter = self._filter if isinstance(self._filter, ModelFilter) else None
-        self.models = self._model_filter is not None
+        if by_sensor and sensors:
+            self.alignment = SensorAlignment(sensors, values["reference"] or None, values["world_frame"])
+        corrects = values["kinect_v2"] and name not in THESIS_FILTERS
+        self._kinects = set(sensors) - set(names_in(values["not_kinects"])) if corrects else set()
+        self._corrects_fused = corrects and (bool(self._kinects) or not sensors)
+        self._ordering = Ordering(sensors, values["order_wait"])
+        self._model_filter = estimator if isinstance(estimator, ModelFilter) else None
         self._lag: FixedLag | None = None
-        if settings.lag:
-            if not isinstance(self._filter, SmoothableFilter):
-                raise graph.GraphError(f"filter {settings.filter_name} cannot smooth (lag, --smooth)")
-            self._lag = FixedLag(self._filter, settings.lag)
-        self._prediction = Prediction(settings.predict_after)
+        if values["lag"]:
+            if not isinstance(estimator, SmoothableFilter):
+                raise graph.GraphError(f"filter {name} cannot smooth (lag, --smooth)")
+            self._lag = FixedLag(estimator, values["lag"])
+        self._prediction = Prediction(values["predict_after"])
         self._lengths = LengthChanges()
-        self._topics = graph.model_topics(settings.body, one_of_several is not None)
-        self._body = settings.body
+        self._topics = graph.model_topics(body, several)
+        self._body = body
         self._publish = publish
-        self._skeleton = one_of_several or self._publish_skeleton
-        self._wanted = wanted if wanted is not None else lambda topic: True
+        self._wanted = wanted
         self._predicted = 0
         self._overtaken = 0
         self._published_ns: int | None = None
-        self._present = False
-        self._received = dict.fromkeys(settings.sensors, 0)
+        self.tracked = False
 
     @property
     def counters(self) -> dict[str, int]:
         counters = dict(self._filter.counters)
         if self.alignment is not None:
-            counters |= {f"frames of {sensor}": count for sensor, count in self._received.items()}
             counters |= {f"alignment {name}": count for name, count in self.alignment.counters.items()}
             counters |= {f"waited {name}": count for name, count in self._ordering.counters.items()}
-        if self.people is not None:
-            counters |= {f"association {name}": count for name, count in self.people.counts.items()}
         if self._model_filter is not None:
             counters["predicted frames"] = self._predicted
             counters["frames that count in the next estimate"] = self._overtaken
         return counters
-
-    def set_pose(self, pose: SensorPose) -> None:
-        """A sensor's pose, in force from its time on."""
-        if self.people is not None:
-            self.people.set_pose(pose)
-        if self.alignment is not None:
-            self.alignment.set_pose(pose)
-
-    def set_clock(self, sensor: str, valid_from_ns: int, clock: ClockModel) -> None:
-        """A sensor's clock, in force from a reference time on."""
-        if self.people is not None:
-            self.people.set_clock(sensor, valid_from_ns, clock)
-        if self.alignment is not None:
-            self.alignment.set_clock(sensor, valid_from_ns, clock)
-
-    def inherit(self, before: object) -> None:
-        """Take over the sensors' poses and clocks from the previous filter: latched messages come once."""
-        if isinstance(before, PersonFilter) and self.by_sensor and before.by_sensor:
-            self.alignment, self.people = before.alignment, before.people
 
     def outputs(self, skeletons: Qos, results: Qos) -> tuple[Port, ...]:
         """The published topics, with these qualities of service of skeletons and results."""
@@ -195,22 +114,17 @@ class PersonFilter:
             Port(topics.urdf, Text(), graph.URDF_QOS),
         )
 
-    @property
-    def tracked(self) -> tuple[str, ...]:
-        """The ids of the people who are tracked."""
-        tracked = self._present if self.people is None else bool(self.people.tracked)
-        return (self._body,) if tracked else ()
-
-    def on_fused(self, skeletons: Sequence[Skeleton], now_ns: int) -> None:
+    def on_fused(self, skeleton: Skeleton, now_ns: int) -> None:
         """One fused frame.
 
         Args:
-            skeletons: in world; the first one is filtered.
+            skeleton: in world.
             now_ns: time of arrival, in a steady clock.
         """
         self.poll(now_ns)
-        skeleton = corrected_kinect(skeletons[0]) if self._corrects_fused else skeletons[0]
-        self._present = True
+        if self._corrects_fused:
+            skeleton = corrected_kinect(skeleton)
+        self.tracked = True
         if self._model_filter is not None:
             self._take([("", skeleton)], now_ns)
         elif (filtered := self._filter.update(skeleton)) is None:
@@ -218,31 +132,19 @@ class PersonFilter:
         elif self._lag is not None:
             self._hold_back(self._lag, filtered, now_ns)
         else:
-            self._skeleton(filtered)
+            self._publish_skeleton(filtered)
 
-    def hold(self, sensor: str, skeletons: Sequence[Skeleton], now_ns: int) -> None:
+    def hold(self, sensor: str, skeleton: Skeleton, now_ns: int) -> None:
         """Queue one frame of one sensor for the next :meth:`poll`, which filters frames in the order of their stamps.
 
         Args:
             sensor: its name.
-            skeletons: the bodies in the frame, in the sensor's own frame and clock.
+            skeleton: the person, in the sensor's own frame and clock.
             now_ns: time of arrival, in a steady clock.
         """
-        aligned = self._aligned(sensor, skeletons)
-        if aligned is not None:
-            self._ordering.hold(sensor, aligned, now_ns)
-
-    def _aligned(self, sensor: str, skeletons: Sequence[Skeleton]) -> Skeleton | None:
-        """The person in ``world``; None where the sensor is not calibrated, or has no person."""
-        self._received[sensor] += 1
-        if self.people is None:
-            subject = skeletons[0]
-        elif found := self.people.sort(sensor, skeletons):
-            ((_, subject),) = found
-        else:
-            return None
-        aligned = None if self.alignment is None else self.alignment.push(sensor, subject)
-        return corrected_kinect(aligned) if aligned is not None and sensor in self._kinects else aligned
+        aligned = None if self.alignment is None else self.alignment.push(sensor, skeleton)
+        if aligned is not None:  # else the sensor is not calibrated
+            self._ordering.hold(sensor, corrected_kinect(aligned) if sensor in self._kinects else aligned, now_ns)
 
     def on_orientation(self, measurement: SegmentOrientation, now_ns: int) -> None:
         """Take the orientation of one segment, in ``world`` and in the reference's clock.
@@ -321,7 +223,7 @@ class PersonFilter:
             assert isinstance(self._filter, SmoothableFilter)
             skeleton, estimate = self._filter.results_of(frame)
             if estimate is None:
-                self._skeleton(skeleton)
+                self._publish_skeleton(skeleton)
             else:
                 self._send(skeleton, estimate)
 
@@ -333,7 +235,7 @@ class PersonFilter:
         self._prediction.stop()
         self._lengths.reset()
         self._published_ns = None
-        self._present = False
+        self.tracked = False
 
     def forget(self) -> None:
         """Forget the person, because the next frames are of another one."""
@@ -379,7 +281,7 @@ class PersonFilter:
         if self._wanted(graph.FILTERED):
             skeleton = skeleton or self._model_filter.filtered
             assert skeleton is not None
-            self._skeleton(skeleton)
+            self._publish_skeleton(skeleton)
         topics = self._topics
         for topic in (topics.state, topics.stddev, topics.covariance, topics.segments):
             if self._wanted(topic):

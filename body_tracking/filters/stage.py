@@ -4,29 +4,35 @@ stage of the node ``skeleton_filter``.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from itertools import groupby
 from typing import Any
 
-from body_tracking.core.orientation import SEGMENT_NUMBER, OrientationError
+from body_tracking.core.orientation import SEGMENT_NUMBER, OrientationError, SegmentOrientation
 from body_tracking.core.parameters import Parameter, Value, fields_of, parameters_from
 from body_tracking.core.qos import RELIABLE as RELIABLE_QOS
+from body_tracking.core.skeleton import NANOSECONDS, Skeleton
 from body_tracking.filters import (
     DEFAULT_FILTER,
     FILTERS,
+    make_filter,
     parameter_classes,
     parameter_prefix,
     prepare,
 )
-from body_tracking.filters.people import PeopleFilter, filter_of
-from body_tracking.filters.person import DEFAULT_ORDER_WAIT, DEFAULT_PREDICT_AFTER, FilterSettings, PersonFilter
+from body_tracking.filters.person import PersonFilter
 from body_tracking.filters.smoothing import MAX_LAG
+from body_tracking.fusion.people import People
 from body_tracking.fusion.stage import calibration_inputs
 from body_tracking.messages.codecs import (
     Ids,
     Orientation,
 )
 from body_tracking.pipeline import graph
-from body_tracking.pipeline.people import PEOPLE, people_from
+from body_tracking.pipeline.people import ALL, PEOPLE, people_from
+from body_tracking.pipeline.roles import role_of
 from body_tracking.pipeline.shared import (
     BODY,
     REFERENCE,
@@ -50,7 +56,7 @@ INPUT = Parameter(
 )
 PREDICT_AFTER = Parameter(
     "predict_after",
-    DEFAULT_PREDICT_AFTER,
+    0.1,
     "ekf: publish predicted frames when no frame has arrived for this long",
     unit="s",
     min=0.01,
@@ -59,7 +65,7 @@ PREDICT_AFTER = Parameter(
 )
 ORDER_WAIT = Parameter(
     "order_wait",
-    DEFAULT_ORDER_WAIT,
+    0.05,
     "input sensors: the longest wait of a frame for an older one of another sensor that is due; 0 for the least "
     "delay: late frames are then inserted and later updates repeated",
     unit="s",
@@ -138,10 +144,15 @@ _CALIBRATIONS = 1000
 """Queue of poses and clocks, long enough that none is lost while the filter is busy."""
 _ORIENTATIONS = 32
 """Queue of orientations per segment: half a second."""
+_AWAY = NANOSECONDS
+"""Nanoseconds without a fused frame of one of several people after which that person is forgotten."""
 
 
 class FilterStage(Stage):
-    """Filters fused skeletons, or every sensor's frames."""
+    """Filters fused skeletons, or every sensor's frames.
+
+    There is a :class:`PersonFilter` for each person who may be tracked, independent of each other.
+    """
 
     NAME = "skeleton_filter"
     PARAMETERS = (
@@ -168,35 +179,52 @@ class FilterStage(Stage):
         self._tracked: tuple[str, ...] = ()
         self._t_poses = 0
         self._stamp_ns = 0
-        self.filter = self._make(values)
-        self._connect(values)
+        self._people: People | None = None
+        self._received = dict.fromkeys(sensors_of(values), 0)
+        self._use(values, self._persons_of(values))
 
-    def _make(self, values: Mapping[str, Value]) -> PersonFilter | PeopleFilter:
-        given: dict[str, Any] = dict(values)
-        name = given["filter"]
-        settings = FilterSettings(
-            name,
-            filter_parameters(name, values),
-            given["input"],
-            sensors_of(values),
-            given["reference"],
-            given["world_frame"],
-            graph.check_body(given["body"]),
-            given["predict_after"],
-            given["order_wait"],
-            people_from(values),
-            given["kinect_v2"],
-            given["lag"],
-            names_in(values["not_kinects"]),
-        )
-        return filter_of(settings, self._publish, self.wanted)
+    def _persons_of(self, values: Mapping[str, Value]) -> dict[str, PersonFilter]:
+        """The filters of the people who may be tracked, by their ids.
 
-    def _connect(self, values: Mapping[str, Value]) -> None:
-        """Set the inputs and outputs of the current filter."""
+        Raises:
+            FilterError: unknown filter, or invalid parameters.
+            GraphError: the filter does not take this input, or cannot smooth.
+            FusionError: the reference is not among the sensors.
+        """
+        name, people = str(values["filter"]), people_from(values)
+        by_sensor = role_of({"filter": name, "filter_input": values["input"]}).input == graph.SENSORS_INPUT
+        if not sensors_of(values) and not by_sensor:
+            raise graph.GraphError(f"filter {name} needs skeletons; inertial sensors alone need --filter ekf")
+        several = people.subject == ALL
+        ids = graph.bodies(people.people) if several else (graph.check_body(str(values["body"])),)
+        return {
+            body: PersonFilter(
+                make_filter(name, **filter_parameters(name, values)),
+                values,
+                body,
+                self._publish,
+                self.wanted,
+                by_sensor=by_sensor,
+                several=several,
+            )
+            for body in ids
+        }
+
+    def _use(self, values: Mapping[str, Value], persons: Mapping[str, PersonFilter]) -> None:
+        """Filter people by these filters from now on; sets the inputs and outputs."""
+        people = people_from(values)
+        self._several = people.subject == ALL
+        self._ids, self._persons = tuple(persons), tuple(persons.values())
+        self._last_ns: dict[int, int] = {}
+        alignment = self._persons[0].alignment
+        if alignment is None:
+            self._people = None
+        elif self._people is None:
+            self._people = People(sensors_of(values), people, alignment.reference, self._gone)
         orientations = orientation_topics(names_in(values["orientations"]))
         self._sensors = {graph.skeleton_topic(sensor): sensor for sensor in sensors_of(values)}
         qos = skeleton_qos(values)
-        if self.filter.by_sensor:
+        if alignment is not None or not self._sensors:
             self.inputs = (
                 *calibration_inputs(len(self._sensors), _CALIBRATIONS),
                 *(skeleton_input(topic, values) for topic in self._sensors),
@@ -204,8 +232,9 @@ class FilterStage(Stage):
             )
         else:
             self.inputs = (skeleton_input(graph.FUSED, values),)
+        ports = (port for person in self._persons for port in person.outputs(qos, result_qos(values)))
         self.outputs = (
-            *self.filter.outputs(qos, result_qos(values)),
+            *{port.topic: port for port in ports}.values(),
             Port(graph.TRACKED, Ids(), RELIABLE_QOS, optional=True),
         )
 
@@ -214,13 +243,18 @@ class FilterStage(Stage):
         return ()
 
     def change(self, values: Mapping[str, Value]) -> None:
-        """Start a new filter at the next frame; frames that the present one holds back are published."""
-        made = self._make(values)
-        self.filter.flush()
-        made.inherit(self.filter)
-        self.filter, self.values = made, values
+        """Start a new filter at the next frame; frames that the present one holds back are published.
+
+        It takes over the sensors' poses and clocks, since latched messages come once.
+        """
+        made = self._persons_of(values)
+        for person, former in zip(made.values(), self._persons, strict=True):
+            former.flush()
+            if person.alignment is not None and former.alignment is not None:
+                person.alignment = former.alignment
+        self._use(values, made)
+        self.values = values
         prepare(str(values["filter"]))
-        self._connect(values)
         there = {port.topic for port in self.outputs}
         self._published = [output for output in self._published if output.topic in there]
 
@@ -228,56 +262,132 @@ class FilterStage(Stage):
         self._published.append(Output(topic, payload, stamp_ns))
 
     def _collect(self) -> Iterable[Output]:
-        """The filter's outputs, and the ids of tracked people if they changed."""
+        """The filters' outputs, and the ids of tracked people if they changed."""
         published, self._published = self._published, []
+        if self._several:
+            published = _together(published)
         if published:
             self._stamp_ns = published[-1].stamp_ns or self._stamp_ns
-        if self.filter.tracked != self._tracked:
-            self._tracked = self.filter.tracked
-            payload = self._stamp_ns, str(self.values["world_frame"]), self._tracked
+        tracked = self._tracked_ids()
+        if tracked != self._tracked:
+            self._tracked = tracked
+            payload = self._stamp_ns, str(self.values["world_frame"]), tracked
             published.append(Output(graph.TRACKED, payload, self._stamp_ns))
         return published
 
+    def _tracked_ids(self) -> tuple[str, ...]:
+        if self._people is not None:
+            return tuple(self._ids[number - 1] for number in self._people.tracked)
+        return tuple(body for body, person in zip(self._ids, self._persons, strict=True) if person.tracked)
+
     def take(self, topic: str, payload: Any, now: Now) -> Iterable[Output]:
-        if topic == graph.CALIBRATION_CLOCK:
-            self.filter.set_clock(*payload)
-        elif topic == graph.CALIBRATION:
-            self.filter.set_pose(payload)
+        if topic in (graph.CALIBRATION, graph.CALIBRATION_CLOCK):
+            for placed in (self._people, *(person.alignment for person in self._persons)):
+                if placed is not None and topic == graph.CALIBRATION:
+                    placed.set_pose(payload)
+                elif placed is not None:
+                    placed.set_clock(*payload)
         elif topic == graph.FUSED:
-            self.filter.on_fused(payload, now.steady_ns)
+            self._take_fused(payload, now.steady_ns)
         elif topic in self._sensors:
-            self.filter.hold(self._sensors[topic], payload, now.steady_ns)
+            self._hold(self._sensors[topic], payload, now.steady_ns)
         else:
-            self.filter.on_orientation(payload, now.steady_ns)
+            self._take_orientation(payload, now.steady_ns)
         return self._collect()
 
+    def _take_fused(self, skeletons: Sequence[Skeleton], now_ns: int) -> None:
+        """Filter one fused frame; unknown numbers of people are ignored."""
+        if self._several:
+            self._take_several(skeletons, now_ns)
+        else:
+            self._persons[0].on_fused(skeletons[0], now_ns)
+        self._poll(now_ns)
+
+    def _take_several(self, skeletons: Sequence[Skeleton], now_ns: int) -> None:
+        stamp_ns = skeletons[0].stamp_ns
+        for number, last_ns in list(self._last_ns.items()):
+            if stamp_ns - last_ns > _AWAY:  # another person may have the number now
+                self._gone(number)
+        for skeleton in skeletons:
+            if 1 <= skeleton.body <= len(self._persons):
+                self._last_ns[skeleton.body] = stamp_ns
+                self._persons[skeleton.body - 1].on_fused(skeleton, now_ns)
+
+    def _hold(self, sensor: str, skeletons: Sequence[Skeleton], now_ns: int) -> None:
+        """Queue the people in one frame of one sensor."""
+        self._received[sensor] += 1
+        assert self._people is not None
+        for number, skeleton in self._people.sort(sensor, skeletons):
+            own = replace(skeleton, body=number) if self._several else skeleton
+            self._persons[number - 1].hold(sensor, own, now_ns)
+
+    def _take_orientation(self, measurement: SegmentOrientation, now_ns: int) -> None:
+        """Take the orientation of one segment of the wearer, of several people the one nearest to the reference."""
+        wearer = self._people.nearest if self._people is not None and self._several else 1
+        if wearer is not None:
+            self._persons[wearer - 1].on_orientation(measurement, now_ns)
+
+    def _gone(self, number: int) -> None:
+        self._last_ns.pop(number, None)
+        self._persons[number - 1].forget()
+
     def poll(self, steady_ns: int) -> Iterable[Output]:
-        self.filter.poll(steady_ns)
+        self._poll(steady_ns)
         return self._collect()
+
+    def _poll(self, now_ns: int) -> None:
+        for person in self._persons:
+            person.poll(now_ns)
+        newest_ns = max(person.newest_ns for person in self._persons)
+        for person in self._persons:  # release held frames of people who are not seen now with the others' frames
+            person.passed(newest_ns)
 
     @property
     def deadline_ns(self) -> int | None:
-        return self.filter.deadline_ns
+        return min((at for person in self._persons if (at := person.deadline_ns) is not None), default=None)
 
     @property
     def due_ns(self) -> int | None:
-        return self.filter.due_ns
+        return min((at for person in self._persons if (at := person.due_ns) is not None), default=None)
 
     def settle(self) -> None:
-        self.filter.settle()
+        for person in self._persons:
+            person.settle()
 
     def reset(self, topic: str) -> None:
         """Reset for fused frames; with sensors' frames the alignment detects jumps itself."""
         if topic == graph.FUSED:
-            self.filter.reset()
+            self._last_ns.clear()
+            for person in self._persons:
+                person.reset()
 
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
-        counters = self.filter.counters
+        counters = self.counters
         before, self._t_poses = self._t_poses, counters.get("t_poses", 0)
         if self._t_poses > before:
             self.events.append("joint centres of this person estimated from a T-pose: angles are more accurate now")
-        return 0, str(self.values["filter"]), {"tracked": ", ".join(self.filter.tracked), **counters}
+        return 0, str(self.values["filter"]), {"tracked": ", ".join(self._tracked_ids()), **counters}
 
     @property
     def counters(self) -> Mapping[str, int]:
-        return self.filter.counters
+        """Sums of all filters' counters, and those of the association of people."""
+        total: Counter[str] = Counter()
+        for person in self._persons:
+            total.update(person.counters)
+        if self._people is not None:
+            total.update({f"frames of {sensor}": count for sensor, count in self._received.items()})
+            total.update({f"association {name}": count for name, count in self._people.counts.items()})
+        return dict(total)
+
+
+def _together(published: Sequence[Output]) -> list[Output]:
+    """The outputs with the filtered skeletons of one time in one message, last."""
+    bodies = [body for output in published if output.topic == graph.FILTERED for body in output.payload]
+    bodies.sort(key=lambda each: (each.stamp_ns, each.body))
+    return [
+        *(output for output in published if output.topic != graph.FILTERED),
+        *(
+            Output(graph.FILTERED, tuple(group), stamp_ns)
+            for stamp_ns, group in groupby(bodies, key=lambda each: each.stamp_ns)
+        ),
+    ]

@@ -13,12 +13,13 @@ from random_people import START_NS, MeasurementErrors, RandomPerson, capture_tim
 
 from body_tracking.core.body_model import SEGMENTS
 from body_tracking.core.orientation import SegmentOrientation
+from body_tracking.core.parameters import check_all
 from body_tracking.core.sensor_poses import level_pose
 from body_tracking.core.skeleton import NANOSECONDS, Skeleton
-from body_tracking.filters.people import PeopleFilter, filter_of
-from body_tracking.filters.person import FilterSettings, PersonFilter
+from body_tracking.filters.stage import FilterStage
 from body_tracking.pipeline import graph
-from body_tracking.pipeline.people import ALL, PeopleParameters
+from body_tracking.pipeline.people import ALL
+from body_tracking.pipeline.stage import Now, Output
 from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.random_motion import RandomMotion
 from draws import some
@@ -29,7 +30,7 @@ DELAYS = 0.02, 0.045
 SECONDS = 1.5
 
 Event = tuple[int, str, Skeleton]
-Staged = tuple[PersonFilter, list[tuple[str, int]], list[Skeleton]]
+Staged = tuple[FilterStage, list[tuple[str, int]], list[Skeleton]]
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +49,15 @@ def events() -> list[Event]:
     return sorted(found, key=lambda event: event[:2])
 
 
+def stage_of(name: str, wanted: Callable[[str], bool] | None = None, **values: Any) -> FilterStage:
+    """The stage with this filter and two calibrated sensors."""
+    given = {"filter": name, "sensors": SENSORS, **values}
+    stage = FilterStage(check_all(FilterStage.PARAMETERS, given), wanted or (lambda topic: True))
+    for sensor in SENSORS:
+        stage.take(graph.CALIBRATION, level_pose(sensor), Now(0, 0))
+    return stage
+
+
 def staged(
     events: list[Event], wanted: Callable[[str], bool] | None = None, busy: float = 0.0, **settings: float
 ) -> Staged:
@@ -55,30 +65,23 @@ def staged(
 
     With ``busy``, it takes all frames that have arrived together, once in so many seconds.
     """
-    published: list[tuple[str, int]] = []
-    skeletons: list[Skeleton] = []
-
-    def publish(topic: str, payload: Any, stamp_ns: int) -> None:
-        published.append((topic, stamp_ns))
-        if topic == graph.FILTERED:
-            skeletons.extend(payload)
-
-    chosen = FilterSettings("ekf", sensors=SENSORS, **settings)  # type: ignore[arg-type]
-    stage = PersonFilter(chosen, publish, wanted)
-    for sensor in SENSORS:
-        stage.set_pose(level_pose(sensor))
+    outputs: list[Output] = []
+    stage = stage_of("ekf", wanted, **settings)
     looked_ns = events[0][0]
     for now_ns, sensor, skeleton in events:
+        topic = graph.skeleton_topic(sensor)
         if busy == 0.0:
-            stage.hold(sensor, [skeleton], now_ns)
-            stage.poll(now_ns)
+            outputs += stage.take(topic, [skeleton], Now(now_ns, now_ns))
+            outputs += stage.poll(now_ns)
             continue
         while now_ns > looked_ns:
-            stage.poll(looked_ns)
+            outputs += stage.poll(looked_ns)
             looked_ns += round(busy * NANOSECONDS)
-        stage.hold(sensor, [skeleton], looked_ns)
+        outputs += stage.take(topic, [skeleton], Now(looked_ns, looked_ns))
     while (deadline_ns := stage.deadline_ns) is not None:
-        stage.poll(deadline_ns)
+        outputs += stage.poll(deadline_ns)
+    published = [(each.topic, each.stamp_ns or 0) for each in outputs if each.topic != graph.TRACKED]
+    skeletons = [body for each in outputs if each.topic == graph.FILTERED for body in each.payload]
     return stage, published, skeletons
 
 
@@ -147,20 +150,10 @@ def test_a_burst_after_a_stall_goes_back_once_and_its_frames_all_count(
 @pytest.mark.parametrize("name", ["lkf_constant_velocity", "ekf"])
 def test_each_of_several_people_is_filtered_as_if_alone(events: list[Event], name: str) -> None:
     """Two who stand 2 m apart, of whom the second is hidden for a while."""
-    whom = PeopleParameters(ALL, 3)
-    ids = graph.bodies(whom.people)
-    published: dict[str, list[tuple[str, Any]]] = {"together": [], "alone 1": [], "alone 2": []}
-
-    def stage_of(who: str) -> PeopleFilter:
-        settings = FilterSettings(name, sensors=SENSORS, people=whom)
-        made = filter_of(settings, lambda topic, payload, stamp_ns: published[who].append((topic, payload)))
-        assert isinstance(made, PeopleFilter)
-        for sensor in SENSORS:
-            made.set_pose(level_pose(sensor))
-        return made
-
-    stages = {who: stage_of(who) for who in published}
-    by_sensor = stages["together"].by_sensor
+    ids = graph.bodies(3)
+    published: dict[str, list[Output]] = {"together": [], "alone 1": [], "alone 2": []}
+    stages = {who: stage_of(name, subject=ALL, people=3) for who in published}
+    by_sensor = name == "ekf"
     taken = events[:70]
     for number, (now_ns, sensor, one) in enumerate(taken):
         shift = np.array([2.0, 0.0, 0.0])
@@ -168,20 +161,19 @@ def test_each_of_several_people_is_filtered_as_if_alone(events: list[Event], nam
         hidden = 30 <= number < 45
         frames = {"together": [one] if hidden else [one, two], "alone 1": [one], "alone 2": [] if hidden else [two]}
         for who, bodies in frames.items():
-            if not bodies:
-                stages[who].poll(now_ns)
-            elif by_sensor:
-                stages[who].hold(sensor, bodies, now_ns)
-                stages[who].poll(now_ns)
-            elif sensor == SENSORS[0]:  # as the fusion has them
+            if bodies and by_sensor:
+                published[who] += stages[who].take(graph.skeleton_topic(sensor), bodies, Now(now_ns, now_ns))
+            elif bodies and sensor == SENSORS[0]:  # as the fusion has them
                 placed = [_fused(body) for body in bodies]
-                stages[who].on_fused(placed, now_ns)
+                published[who] += stages[who].take(graph.FUSED, placed, Now(now_ns, now_ns))
+            if by_sensor or not bodies:
+                published[who] += stages[who].poll(now_ns)
     filtered: dict[str, list[Skeleton]] = {
-        who: [each for topic, payload in messages if topic == graph.FILTERED for each in payload]
-        for who, messages in published.items()
+        who: [body for each in outputs if each.topic == graph.FILTERED for body in each.payload]
+        for who, outputs in published.items()
     }
-    assert any(len(payload) == 2 for topic, payload in published["together"] if topic == graph.FILTERED)
-    assert stages["together"].tracked == ids[:2]
+    assert any(len(each.payload) == 2 for each in published["together"] if each.topic == graph.FILTERED)
+    assert [each.payload[2] for each in published["together"] if each.topic == graph.TRACKED][-1] == ids[:2]
     for number in (1, 2):
         mine = [each for each in filtered["together"] if each.body == number]
         # a single person is the first one
@@ -193,8 +185,8 @@ def test_each_of_several_people_is_filtered_as_if_alone(events: list[Event], nam
         if by_sensor:
             state = graph.model_topics(ids[number - 1], several=True).state
             alone = graph.model_topics(ids[0], several=True).state
-            states = [each.q.tolist() for topic, each in published["together"] if topic == state]
-            same_states = [each.q.tolist() for topic, each in published[f"alone {number}"] if topic == alone]
+            states = [each.payload.q.tolist() for each in published["together"] if each.topic == state]
+            same_states = [each.payload.q.tolist() for each in published[f"alone {number}"] if each.topic == alone]
             assert states == same_states and len(states) > 20
 
 
@@ -231,7 +223,6 @@ def test_frames_of_one_instant_give_one_output(events: list[Event], lag: float) 
         stamp_ns = skeleton.stamp_ns // period_ns * period_ns
         together.append((now_ns, sensor, replace(skeleton, stamp_ns=stamp_ns)))
     stage, published, _ = staged(together, lag=lag)
-    stage.flush()
     stamps = [stamp_ns for topic, stamp_ns in published if topic == graph.MODEL_STATE]
     assert len(stamps) > 20 and stamps == sorted(set(stamps))
     assert stage.counters["frames"] > 1.5 * len(stamps)
@@ -243,23 +234,20 @@ def test_orientations_alone_are_published_at_the_rate_of_predicted_frames(lag: f
     person, motion = RandomPerson.draw(rng), RandomMotion(rng, 3.0)
     times = np.arange(0.0, 3.0, 0.02)
     rotations = MODEL.forward(motion.configuration(times), person.lengths).rotations
-    published: list[tuple[str, int]] = []
-    stage = PersonFilter(
-        FilterSettings("ekf", sensors=SENSORS, lag=lag),
-        lambda topic, payload, stamp_ns: published.append((topic, stamp_ns)),
-    )
-    linear = PersonFilter(
-        FilterSettings("lkf_constant_velocity", sensors=SENSORS), lambda topic, payload, stamp_ns: None
-    )
+    outputs: list[Output] = []
+    segments = ("pelvis", "upper_trunk", "forearm_left")
+    stage = stage_of("ekf", lag=lag, orientations=segments)
+    linear = stage_of("lkf_constant_velocity")
     for time, posture in zip(times, rotations, strict=True):
         stamp_ns = START_NS + round(time * NANOSECONDS)
-        for number, name in enumerate(("pelvis", "upper_trunk", "forearm_left")):
-            rotation = posture[SEGMENTS.index(name)]
+        for number, name in enumerate(segments):
+            rotation, topic = posture[SEGMENTS.index(name)], graph.orientation_topic(name)
             measurement = SegmentOrientation(stamp_ns + number, name, name, rotation, 1e-4 * np.eye(3))
-            stage.on_orientation(measurement, stamp_ns + NANOSECONDS // 100)
-            stage.poll(stamp_ns + NANOSECONDS // 100)
-            linear.on_orientation(measurement, stamp_ns + NANOSECONDS // 100)
-    stamps = [stamp_ns for topic, stamp_ns in published if topic == graph.MODEL_STATE]
+            now_ns = stamp_ns + NANOSECONDS // 100
+            outputs += stage.take(topic, measurement, Now(now_ns, now_ns))
+            outputs += stage.poll(now_ns)
+            linear.take(topic, measurement, Now(now_ns, now_ns))
+    stamps = [each.stamp_ns or 0 for each in outputs if each.topic == graph.MODEL_STATE]
     assert len(stamps) > 40 and stamps == sorted(stamps)  # 30 Hz of the 1.9 s after the start
     # of three sensors of 50 Hz every second one, of the two seconds after the start
     assert stage.counters["orientations_used"] >= 3 * 2 * 25 - 3

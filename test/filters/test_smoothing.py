@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -18,15 +18,13 @@ from body_tracking.filters.ekf.filter import ExtendedKalmanFilter
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.linear import CONSTANT_VELOCITY, LinearKalmanFilter
 from body_tracking.filters.parameters import LinearKalmanParameters
-from body_tracking.filters.people import filter_of
-from body_tracking.filters.person import FilterSettings
 from body_tracking.filters.smoothing import FixedLag, SmoothableFilter
 from body_tracking.filters.stage import FilterStage
 from body_tracking.kinematics.motion import joint_densities
 from body_tracking.kinematics.upper_body import UNOBSERVED
 from body_tracking.pipeline import graph
-from body_tracking.pipeline.people import ALL, PeopleParameters
-from body_tracking.pipeline.stage import Now
+from body_tracking.pipeline.people import ALL
+from body_tracking.pipeline.stage import Now, Output
 from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.random_motion import RandomMotion
 from draws import draws
@@ -194,31 +192,36 @@ def test_smoothed_people_err_less_and_by_no_more_than_they_state() -> None:
 
 
 class Bench:
-    """A filter of people, and its published messages: topic, stamp and time of publication."""
+    """The stage with a filter of fused skeletons, and its messages: topic, stamp and time of publication."""
 
-    def __init__(self, name: str, **settings: Any) -> None:
+    def __init__(self, name: str, **values: Any) -> None:
         self.published: list[tuple[str, int, int]] = []
         self.skeletons: list[Skeleton] = []
         self.now_ns = 0
-        self.filter = filter_of(
-            FilterSettings(name, input=graph.FUSED_INPUT, sensors=("kinect1",), **settings), self._publish
-        )
+        given = {"filter": name, "input": graph.FUSED_INPUT, "sensors": ("kinect1",), **values}
+        self.stage = FilterStage(check_all(FilterStage.PARAMETERS, given))
 
-    def _publish(self, topic: str, payload: Any, stamp_ns: int) -> None:
-        self.published.append((topic, stamp_ns, self.now_ns))
-        if topic == graph.FILTERED:
-            self.skeletons.extend(payload)
+    def _publish(self, outputs: Iterable[Output]) -> None:
+        for each in outputs:
+            if each.topic != graph.TRACKED:
+                self.published.append((each.topic, each.stamp_ns or 0, self.now_ns))
+            if each.topic == graph.FILTERED:
+                self.skeletons.extend(each.payload)
 
     def feed(self, frames: Sequence[Sequence[Skeleton]], delay_ns: int = 20_000_000) -> None:
         for each in frames:
             self.now_ns = each[0].stamp_ns + delay_ns
-            self.filter.on_fused(each, self.now_ns)
-            self.filter.poll(self.now_ns)
+            self._publish(self.stage.take(graph.FUSED, each, Now(self.now_ns, self.now_ns)))
+            self._publish(self.stage.poll(self.now_ns))
+
+    def reset(self) -> None:
+        self.stage.reset(graph.FUSED)
+        self._publish(self.stage.poll(self.now_ns))
 
     def end(self) -> None:
-        while self.filter.deadline_ns is not None:
-            self.now_ns = self.filter.deadline_ns
-            self.filter.poll(self.now_ns)
+        while self.stage.deadline_ns is not None:
+            self.now_ns = self.stage.deadline_ns
+            self._publish(self.stage.poll(self.now_ns))
 
     def stamps(self, topic: str = graph.FILTERED) -> list[int]:
         return [stamp_ns for each, stamp_ns, _ in self.published if each == topic]
@@ -260,7 +263,7 @@ def test_smoothing_leaves_the_filter_itself_alone(name: str) -> None:
     plain, beside = (Bench(name, lag=lag) for lag in (0.0, LAG))
     for bench in (plain, beside):
         bench.feed([[each] for each in frames])
-    one, other = (bench.filter._filter for bench in (plain, beside))  # type: ignore[union-attr]
+    one, other = (bench.stage._persons[0]._filter for bench in (plain, beside))
     last = frames[-1].stamp_ns + FRAME_NS
     one, other = one.update(replace(frames[-1], stamp_ns=last)), other.update(replace(frames[-1], stamp_ns=last))
     assert one is not None and other is not None
@@ -275,7 +278,7 @@ def test_frames_before_a_jump_of_time_are_published_before_those_after_it(announ
     second = [NANOSECONDS + k * FRAME_NS for k in range(10)]
     bench.feed([[frame(stamp_ns)] for stamp_ns in first])
     if announced:
-        bench.filter.reset()
+        bench.reset()
         assert bench.stamps() == first
     bench.feed([[frame(stamp_ns)] for stamp_ns in second])
     bench.end()
@@ -283,8 +286,7 @@ def test_frames_before_a_jump_of_time_are_published_before_those_after_it(announ
 
 
 def test_one_who_is_hidden_does_not_come_after_the_others() -> None:
-    both = PeopleParameters(ALL, 2)
-    bench = Bench("lkf_constant_velocity", lag=LAG, people=both)
+    bench = Bench("lkf_constant_velocity", lag=LAG, subject=ALL, people=2)
     one = [frame(1 + k * FRAME_NS, body=1) for k in range(30)]
     two = [frame(1 + k * FRAME_NS, BODY + 2.0, body=2) for k in range(30)]
     bench.feed([[a] if 10 <= k < 20 else [a, b] for k, (a, b) in enumerate(zip(one, two, strict=True))])
