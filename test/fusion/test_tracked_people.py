@@ -9,12 +9,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from body_tracking.core.clocks import ClockModel
+from body_tracking.core.parameters import check_all
 from body_tracking.core.sensor_poses import SensorPose, level_pose
 from body_tracking.core.skeleton import NANOSECONDS, Skeleton
 from body_tracking.fusion.fusion import Fusion
 from body_tracking.fusion.people import People, Slots
-from body_tracking.fusion.people_fusion import PeopleFusion
+from body_tracking.fusion.stage import FusionStage
+from body_tracking.pipeline import graph
 from body_tracking.pipeline.people import ALL, FIRST, NEAREST, PeopleParameters
+from body_tracking.pipeline.stage import Now
 from walkers import ABOUT_FACE, frame, performed
 
 SENSORS = ("kinect1", "kinect2")
@@ -136,12 +139,16 @@ def test_a_lone_person_keeps_the_number_when_another_one_comes() -> None:
 
 def test_each_person_is_fused_as_if_alone() -> None:
     rng = np.random.default_rng(0)
-    several = PeopleFusion(SENSORS, people=PeopleParameters(ALL))
+    several = FusionStage(check_all(FusionStage.PARAMETERS, {"sensors": SENSORS, "subject": ALL}))
     alone = [Fusion(SENSORS) for _ in range(2)]
-    for fusion in (several, *alone):
+    clock = "kinect2", 0, ClockModel(round(OFF * NANOSECONDS))
+    for pose in POSES.values():
+        several.take(graph.CALIBRATION, pose, Now(0, 0))
+    several.take(graph.CALIBRATION_CLOCK, clock, Now(0, 0))
+    for fusion in alone:
         for pose in POSES.values():
             fusion.set_pose(pose)
-        fusion.set_clock("kinect2", 0, ClockModel(round(OFF * NANOSECONDS)))
+        fusion.set_clock(*clock)
     together: list[Skeleton] = []
     apart: list[list[Skeleton]] = [[], []]
     for step in range(60):
@@ -152,7 +159,8 @@ def test_each_person_is_fused_as_if_alone() -> None:
                 replace(each, positions=each.positions + 0.01 * rng.normal(size=(25, 3)))
                 for each in seen(sensor, time, {0: (1.5, 0.3), 1: (2.8, -0.3)})
             ]
-            together += [each for group in several.push(sensor, bodies, now_ns) for each in group]
+            outputs = several.take(graph.skeleton_topic(sensor), bodies, Now(now_ns, now_ns))
+            together += [each for output in outputs for each in output.payload]
             for fusion, found, body in zip(alone, apart, bodies, strict=True):
                 found += fusion.push(sensor, body, now_ns)
     for number, found in enumerate(apart, 1):
