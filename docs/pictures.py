@@ -25,9 +25,8 @@ from matplotlib.axes import Axes
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.skeleton import Joint, Skeleton
 from body_tracking.evaluation.show import summarise
-from body_tracking.kinematics.conventions import angles_of
+from body_tracking.kinematics.conventions import angle_names, angles_of
 from body_tracking.kinematics.positional import positional_angles
-from body_tracking.kinematics.tracking import angle_names
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.recording.replay import ReplaySettings, replay
 

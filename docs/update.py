@@ -16,7 +16,7 @@ from body_tracking import cli, systems
 from body_tracking.core.parameters import Parameter, Value, grouped
 from body_tracking.core.qos import Qos
 from body_tracking.kinect import simulated as kinect
-from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
+from body_tracking.kinematics.conventions import ALL_CONVENTIONS, angle_names
 from body_tracking.pipeline.roles import ROLES
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -17,7 +17,7 @@ from body_tracking.filters.smoothing import FixedLag, SmoothableFilter
 from body_tracking.fusion.alignment import SensorAlignment
 from body_tracking.fusion.ordering import Ordering
 from body_tracking.kinematics.codecs import Segments
-from body_tracking.kinematics.tracking import LengthChanges
+from body_tracking.kinematics.lengths import LengthChanges
 from body_tracking.messages.codecs import (
     ModelCovariance,
     ModelState,

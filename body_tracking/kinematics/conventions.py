@@ -39,10 +39,14 @@ from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.joint_angles import JointAngles
 from body_tracking.core.skeleton import FloatArray, IntArray
 from body_tracking.kinematics.euler import EulerAngles, EulerSequences
+from body_tracking.kinematics.positional import ANGLE_NAMES
 from body_tracking.kinematics.ranges import RANGES
 from body_tracking.kinematics.upper_body import SHOULDER_AXES, UpperBody
+from body_tracking.pipeline.graph import POSITIONAL
 
 CONVENTIONS: Final = ("model", "isb", "rep155", "dh26")
+ALL_CONVENTIONS: Final = (*CONVENTIONS, POSITIONAL)
+"""With that of :mod:`body_tracking.kinematics.positional`, which needs no model."""
 
 UNIFORM_STDDEV = np.pi / np.sqrt(3.0)
 """Radians: the standard deviation of a uniformly distributed angle, near a singular pose."""
@@ -396,6 +400,15 @@ def convention(name: str, model: UpperBody) -> Convention:
     if name not in builders:
         raise ConventionError(f"angle convention {name!r}, {one_of(name, CONVENTIONS)}")
     return builders[name](model)
+
+
+def angle_names(name: str) -> tuple[str, ...]:
+    """The angles of one of :data:`ALL_CONVENTIONS`, in order.
+
+    Raises:
+        ConventionError: unknown convention.
+    """
+    return ANGLE_NAMES if name == POSITIONAL else convention(name, UpperBody()).names
 
 
 def angles_of(estimate: ModelEstimate, model: UpperBody, name: str, previous: JointAngles | None = None) -> JointAngles:

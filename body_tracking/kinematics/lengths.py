@@ -1,7 +1,7 @@
 """Estimation of a person's segment lengths from the distances between the points of many frames.
 
 Independent of the estimated pose. :class:`SegmentLengths` estimates from sensors' frames, :class:`SkeletonLengths` from
-filtered skeletons, after every frame.
+filtered skeletons, after every frame. :class:`LengthChanges` decides when to publish them.
 
 A sensor's error of a length depends on the pose, is a tenth of the length and more, and lasts for seconds. Frames are
 therefore not independent:
@@ -364,6 +364,37 @@ class SkeletonLengths:
         from_other = ~seen & seen[_OTHER_SIDE]
         self._target = np.where(from_other, estimate.lengths[_OTHER_SIDE], estimate.lengths)
         self.stddev = np.where(seen, np.sqrt(estimate.covariance.diagonal()), np.inf)
+
+
+class LengthChanges:
+    """Decides when to publish segment lengths: at first, when they change, and when they settle."""
+
+    TOLERANCE = 0.002
+    """Least difference of a length from the published one, metres."""
+    PERIOD_NS = NANOSECONDS
+    """Least time between two publications."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the person."""
+        self._published: FloatArray | None = None
+        self._published_ns = 0
+        self._before: FloatArray | None = None
+
+    def due(self, stamp_ns: int, lengths: FloatArray) -> bool:
+        """Whether to publish these (n,) lengths, metres, of this capture time; if so, they count as published."""
+        settled = self._before is not None and np.array_equal(self._before, lengths)
+        self._before = lengths
+        if self._published is not None:
+            if 0 <= stamp_ns - self._published_ns < self.PERIOD_NS:
+                return False
+            change = float(np.abs(lengths - self._published).max())
+            if change <= self.TOLERANCE and not (settled and change > 0.0):
+                return False
+        self._published, self._published_ns = lengths, stamp_ns
+        return True
 
 
 def _block(frames: tuple[_Frame, ...], white: FloatArray, slow: float, stretch: float) -> _Block:

@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from body_tracking.core import so3
+from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.joint_angles import JointAngles
 from body_tracking.core.measurement import BONE_CORRELATION
 from body_tracking.core.parameters import Parameter, Value
-from body_tracking.core.skeleton import Skeleton
-from body_tracking.kinematics.tracking import ALL_CONVENTIONS, AngleStream, state_estimate
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Skeleton
+from body_tracking.kinematics.conventions import ALL_CONVENTIONS, ConventionError, angles_of
+from body_tracking.kinematics.positional import positional_angles
+from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.codecs import Angles, ModelCovariance, ModelState
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.people import ALL, PEOPLE, PeopleParameters, people_from
 from body_tracking.pipeline.shared import BODY, RELIABLE, result_qos, skeleton_input, skeleton_qos
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
+
+if TYPE_CHECKING:
+    from body_tracking.kinematics.skeleton_fit import SkeletonFit
 
 ANGLES = (
     Parameter(
@@ -49,9 +60,112 @@ ANGLES = (
 
 _AWAY_S = 1.0
 """With several people, a person's state is reset after an absence of this long, seconds."""
+_BAND = 1.96
+"""Standard deviations of a 95 % band."""
+_DOUBT_S = 0.2
+"""Seconds in which the doubt about an angle that has jumped falls to 1 / e."""
 _UNPAIRED = 1000
 """Largest number of a person's states and covariances that wait for each other: the depth of reliable topics, because
 a resent message comes late."""
+
+
+class JumpDoubt:
+    """Adds to the deviations of angles that have jumped.
+
+    Where two successive estimates of an angle lie farther apart than both their 95 % bands allow, one of them was
+    wrong, and nothing says which: sides were swapped, a limb was found again, or the convention's angles jumped back
+    into their usual ranges. The deviation then covers the value before, and returns to the stated one within half a
+    second or so.
+    """
+
+    def __init__(self) -> None:
+        self._last: JointAngles | None = None
+        self._doubt: FloatArray = np.zeros(0)
+
+    def reset(self) -> None:
+        """Forget the person."""
+        self._last = None
+
+    def __call__(self, angles: JointAngles) -> JointAngles:
+        """The angles of the next instant, with their deviations, radians."""
+        last, self._last = self._last, angles
+        if last is None or last.names != angles.names:
+            self._doubt = np.zeros(len(angles.names))
+            return angles
+        seconds = (angles.stamp_ns - last.stamp_ns) / NANOSECONDS
+        moved = np.nan_to_num(0.5 * seconds * (last.velocity + angles.velocity))
+        step = np.abs(so3.wrapped(angles.position - last.position - moved))
+        jumped = step > _BAND * np.hypot(last.position_stddev, angles.position_stddev)  # never where one is NaN
+        self._doubt *= math.exp(-max(seconds, 0.0) / _DOUBT_S)
+        self._doubt = np.where(jumped, np.maximum(self._doubt, step / _BAND), self._doubt)
+        return replace(angles, position_stddev=np.hypot(angles.position_stddev, self._doubt))
+
+
+class AngleStream:
+    """Joint angles in one convention, of skeletons or of states of ``upper_body``, one instant after the other.
+
+    Args:
+        convention: one of ``ALL_CONVENTIONS``.
+        forget_after: seconds without the person after which the next frame is of another one.
+        of_bones: correlation of the errors of the two joints of a bone, for positional angles.
+
+    Raises:
+        ConventionError: unknown convention.
+    """
+
+    def __init__(self, convention: str, forget_after: float = math.inf, of_bones: float = BONE_CORRELATION) -> None:
+        if convention not in ALL_CONVENTIONS:
+            raise ConventionError(f"angle convention {convention!r}: not one of {', '.join(ALL_CONVENTIONS)}")
+        self.convention = convention
+        self.model = UpperBody()
+        self._fit: SkeletonFit | None = None
+        self._previous: JointAngles | None = None
+        self._doubt = JumpDoubt()
+        self._forget_after_ns, self._of_bones = forget_after * NANOSECONDS, of_bones
+
+    def reset(self) -> None:
+        """Forget the person."""
+        if self._fit is not None:
+            self._fit.reset()
+        self._doubt.reset()
+        self._previous = None
+
+    @property
+    def counters(self) -> Counter[str]:
+        """Events of the fits of the model to skeletons."""
+        return Counter() if self._fit is None else self._fit.counters
+
+    def prepare(self) -> SkeletonFit:
+        """The fit of the model to skeletons; the first call compiles its loops, or loads them from the cache."""
+        if self._fit is None:
+            from body_tracking.kinematics.skeleton_fit import SkeletonFit  # imports numba: half a second
+
+            self._fit = SkeletonFit()
+        return self._fit
+
+    def of_skeleton(self, skeleton: Skeleton) -> JointAngles | None:
+        """The angles of one frame; None if the convention needs a model and no trunk is seen."""
+        self._reset_after_gap(skeleton.stamp_ns)
+        if self.convention == graph.POSITIONAL:
+            self._previous = positional_angles(skeleton, self._of_bones)
+            return self._doubt(self._previous)
+        estimate = self.prepare().update(skeleton)
+        return None if estimate is None else self.of_estimate(estimate)
+
+    def of_estimate(self, estimate: ModelEstimate) -> JointAngles:
+        """The angles of one state of the model.
+
+        Raises:
+            ConventionError: the convention is positional.
+        """
+        self._reset_after_gap(estimate.stamp_ns)
+        angles = angles_of(estimate, self.model, self.convention, self._previous)
+        self._previous = angles
+        return self._doubt(angles)
+
+    def _reset_after_gap(self, stamp_ns: int) -> None:
+        if self._previous is not None and stamp_ns - self._previous.stamp_ns > self._forget_after_ns:
+            self.reset()
 
 
 def angle_streams(
@@ -86,6 +200,23 @@ def by_person(skeletons: Sequence[Skeleton], ids: Collection[str], *, several: b
             yield body, skeletons[0]
             return
         yield from ((body, skeleton) for skeleton in skeletons if skeleton.body == number)
+
+
+def state_estimate(
+    model: UpperBody, stamp_ns: int, frame_id: str, q: FloatArray, velocity: FloatArray, covariance: FloatArray
+) -> ModelEstimate:
+    """An estimate of the pose, with default lengths of infinite standard deviation.
+
+    Args:
+        model: the body.
+        stamp_ns: capture time, nanoseconds.
+        frame_id: of the base.
+        q: (nq,) configuration.
+        velocity: (nv,) tangent velocity.
+        covariance: (2 nv, 2 nv) of both.
+    """
+    lengths = model.default_lengths()
+    return ModelEstimate(stamp_ns, frame_id, 0, q, velocity, covariance, lengths, np.full(len(lengths), np.inf))
 
 
 class AnglesStage(Stage):

@@ -23,7 +23,7 @@ from body_tracking.pipeline.system import (
 
 
 def _conventions() -> Sequence[str]:
-    from body_tracking.kinematics.tracking import ALL_CONVENTIONS
+    from body_tracking.kinematics.conventions import ALL_CONVENTIONS
 
     return ALL_CONVENTIONS
 

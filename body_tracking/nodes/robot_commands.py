@@ -29,7 +29,7 @@ from body_tracking.core.qos import LATCHED
 from body_tracking.core.qos import RELIABLE as RELIABLE_QOS
 from body_tracking.core.skeleton import Skeleton
 from body_tracking.core.sources import check_sensor_name
-from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
+from body_tracking.kinematics.conventions import ALL_CONVENTIONS, angle_names
 from body_tracking.messages.angles import joint_states_to_angles
 from body_tracking.messages.base import MessageError, to_nanoseconds
 from body_tracking.messages.calibration import transform_to_pose

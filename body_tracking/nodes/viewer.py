@@ -32,7 +32,7 @@ from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Skeleton
 from body_tracking.core.sources import check_sensor_name
 from body_tracking.filters import FILTERS
-from body_tracking.kinematics.tracking import ALL_CONVENTIONS
+from body_tracking.kinematics.conventions import ALL_CONVENTIONS
 from body_tracking.messages.angles import joint_state_values
 from body_tracking.messages.base import MessageError
 from body_tracking.messages.calibration import transform_to_pose

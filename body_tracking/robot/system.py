@@ -45,7 +45,7 @@ def convention_of(mapping: Path, asked: str) -> str:
         GraphError: another convention is requested.
     """
     # imported here: only a graph with a robot needs them
-    from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
+    from body_tracking.kinematics.conventions import ALL_CONVENTIONS, angle_names
     from body_tracking.robot.mapping import load
 
     found = load(mapping, {name: angle_names(name) for name in ALL_CONVENTIONS}).convention

@@ -126,7 +126,7 @@ def _choose(
     except ImportError as error:
         raise UpError(f"the page needs viser ({error}): {pip_install('viewer')}") from error
     from body_tracking.filters import FILTERS
-    from body_tracking.kinematics.tracking import ALL_CONVENTIONS
+    from body_tracking.kinematics.conventions import ALL_CONVENTIONS
     from body_tracking.ros.discovery import Domain, Watch
     from body_tracking.viewing.state import GREEN, ORANGE, RED
 

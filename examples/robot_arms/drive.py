@@ -32,7 +32,7 @@ from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
+from body_tracking.kinematics.conventions import ALL_CONVENTIONS, angle_names
 from body_tracking.messages.diagnostics import statuses
 from body_tracking.pipeline.graph import (
     DEFAULT_BODY,

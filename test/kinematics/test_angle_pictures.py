@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from body_tracking.kinematics.tracking import angle_names
+from body_tracking.kinematics.conventions import angle_names
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 BY = 0.2

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from body_tracking.kinematics.conventions import ALL_CONVENTIONS, angle_names
 from body_tracking.kinematics.labels import LIMBS, OTHER, by_limb, label_of, limb_of
-from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
 
 
 @pytest.mark.parametrize("convention", ALL_CONVENTIONS)

@@ -30,7 +30,7 @@ from visualization_msgs.msg import Marker, MarkerArray  # noqa: E402
 from body_tracking.core.clocks import ClockModel  # noqa: E402
 from body_tracking.core.sensor_poses import level_pose  # noqa: E402
 from body_tracking.core.skeleton import NANOSECONDS, Skeleton  # noqa: E402
-from body_tracking.kinematics.tracking import angle_names  # noqa: E402
+from body_tracking.kinematics.conventions import angle_names  # noqa: E402
 from body_tracking.kinematics.upper_body import UpperBody  # noqa: E402
 from body_tracking.messages.base import RosMessages, to_nanoseconds  # noqa: E402
 from body_tracking.messages.calibration import clock_to_time_reference, pose_to_transform  # noqa: E402

@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 
 from body_tracking import systems
 from body_tracking.core.parameters import ParameterError
-from body_tracking.kinematics.tracking import angle_names
+from body_tracking.kinematics.conventions import angle_names
 from body_tracking.pipeline import graph
 
 PARAMETERS: dict[str, dict[str, object]] = {

@@ -28,8 +28,12 @@ from trajectory_msgs.msg import JointTrajectory  # noqa: E402
 from body_tracking.core.qos import RELIABLE as RELIABLE_QOS  # noqa: E402
 from body_tracking.core.qos import SENSOR_DATA  # noqa: E402
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray  # noqa: E402
-from body_tracking.kinematics.conventions import angles_of  # noqa: E402
-from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names, state_estimate  # noqa: E402
+from body_tracking.kinematics.conventions import (  # noqa: E402
+    ALL_CONVENTIONS,
+    angle_names,
+    angles_of,
+)
+from body_tracking.kinematics.stage import state_estimate  # noqa: E402
 from body_tracking.kinematics.upper_body import UpperBody  # noqa: E402
 from body_tracking.messages.angles import angles_to_joint_states  # noqa: E402
 from body_tracking.messages.base import to_nanoseconds, to_time  # noqa: E402

@@ -23,7 +23,7 @@ from std_srvs.srv import Trigger  # noqa: E402
 
 from body_tracking.core.joint_angles import JointAngles  # noqa: E402
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Skeleton  # noqa: E402
-from body_tracking.kinematics.tracking import angle_names  # noqa: E402
+from body_tracking.kinematics.conventions import angle_names  # noqa: E402
 from body_tracking.messages.angles import angles_to_joint_states  # noqa: E402
 from body_tracking.messages.cdr import encode_skeletons  # noqa: E402
 from body_tracking.nodes.robot_commands import RobotCommands  # noqa: E402

@@ -13,7 +13,7 @@ from small_mappings import ANGLES, content, mapping
 
 from body_tracking.core.message_types import JOINT_STATE
 from body_tracking.core.parameters import parameters_from
-from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
+from body_tracking.kinematics.conventions import ALL_CONVENTIONS, angle_names
 from body_tracking.pipeline.graph import joint_states_stddev_topic
 from body_tracking.recording.rosbag2 import BagReader, deserialize
 from body_tracking.robot.mapping import MappingError, SafetyLimits, load

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from simulated_arm import SimulatedArm
 
 from body_tracking.core import so3
-from body_tracking.kinematics.conventions import angles_of
-from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names, state_estimate
+from body_tracking.kinematics.conventions import ALL_CONVENTIONS, angle_names, angles_of
+from body_tracking.kinematics.stage import state_estimate
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.robot.mapping import RobotMapping, load
 from draws import draws

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from body_tracking.core.skeleton import NANOSECONDS
+from body_tracking.kinematics.conventions import ALL_CONVENTIONS, angle_names
 from body_tracking.kinematics.labels import label_of
-from body_tracking.kinematics.tracking import ALL_CONVENTIONS, angle_names
 from body_tracking.viewing.curves import BAND, WIDEST, AngleHistory, extremes, first_choice, heading_of
 from draws import draws
 

@@ -11,16 +11,12 @@ from numpy.testing import assert_allclose
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.joint_angles import JointAngles
 from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
-from body_tracking.kinematics.conventions import ConventionError, angles_of
+from body_tracking.kinematics.codecs import segment_poses
+from body_tracking.kinematics.conventions import ALL_CONVENTIONS, ConventionError, angles_of
+from body_tracking.kinematics.lengths import LengthChanges
 from body_tracking.kinematics.positional import positional_angles
 from body_tracking.kinematics.skeleton_fit import SkeletonFit
-from body_tracking.kinematics.tracking import (
-    ALL_CONVENTIONS,
-    AngleStream,
-    JumpDoubt,
-    LengthChanges,
-    segment_poses,
-)
+from body_tracking.kinematics.stage import AngleStream, JumpDoubt
 from body_tracking.kinematics.upper_body import UNOBSERVED, UpperBody
 from draws import draws
 
