@@ -127,6 +127,8 @@ class CsvRecording:
         if missing or strange:
             # Both together: a misspelt column is usually also a missing one.
             parts = [_listing("missing column", missing), _listing("unknown joint column", strange)]
+            if len(missing) > len(_COORDINATES) // 2:
+                parts.append("docs/recordings.md lists the columns of each kind of CSV file")
             raise self._file.error(1, "; ".join(part for part in parts if part))
         return names
 

@@ -169,6 +169,10 @@ WRONG: list[tuple[Callable[[list[str]], str | bytes], str]] = [
     (lambda lines: b"", "the file is empty"),
     (lambda lines: b"\xff\xfe\x00\x01", "line 1: not UTF-8"),
     (lambda lines: b"stamp\n", "missing columns"),
+    (
+        lambda lines: b"time,left_elbow\n0,1\n",
+        "and 71 more; docs/recordings.md lists the columns of each kind of CSV file$",
+    ),
     (lambda lines: b"stamp;person;Head_x\n", "line 1: cells are separated by ';', expected ','"),
     (lambda lines: b"stamp\tperson\tHead_x\n", r"line 1: cells are separated by '\\t', expected ','"),
     (lambda lines: b'"stamp\n', "line 1"),

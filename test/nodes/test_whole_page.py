@@ -94,6 +94,7 @@ def test_from_the_start_page_to_a_recording_and_back(start_page: Browser) -> Non
     browser.reads("play camera_reaching")
     browser.reads("play markers_arm")
     at_both_sizes(browser)
+    page.get_by_text("in this folder: 15.4 s").scroll_into_view_if_needed()
     browser.save("viewer_start.png")
     field = page.locator("xpath=//label[.='path']/following::input[1]")
     field.fill("nowhere")
