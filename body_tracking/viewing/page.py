@@ -55,6 +55,8 @@ _FIELD: Final = float(np.radians(45.0))
 """Vertical angle of view."""
 _ARMS: Final = 1.1
 """Metres from the middle of a person with raised arms that are in view, also in a narrow scene ..."""
+_ROOM_S: Final = 10.0
+"""Seconds in which a browser makes room for the panels."""
 _FARTHEST: Final = 4.0
 """... but from no farther away than so many times :data:`_CAMERA_OFFSET`."""
 
@@ -261,9 +263,23 @@ class Page:
         show(self._axes, bool(there))
 
     def _look_at_person(self, client: viser.ClientHandle) -> None:
+        """Show the whole person to a new browser, again when it has made room for the panels of this page."""
+        # now it has none, or the wider ones of the start page
+        self._look(client, client.camera.image_width - 2 * WIDTH)
+        width, end = client.camera.image_width, time.monotonic() + _ROOM_S
+
+        def resized(camera: viser.CameraHandle) -> None:
+            nonlocal width
+            if camera.image_width != width and time.monotonic() < end:
+                width = camera.image_width
+                self._look(client, width)
+
+        client.camera.on_update(resized)
+
+    def _look(self, client: viser.ClientHandle, width: int) -> None:
+        """Look at the person, in a scene of so many pixels in width."""
         target = self._target
-        # the browser has not yet made room for the panels
-        aspect = max(client.camera.image_width - 2 * WIDTH, 1) / max(client.camera.image_height, 1)
+        aspect = max(width, 1) / max(client.camera.image_height, 1)
         half_width = float(np.linalg.norm(_CAMERA_OFFSET) * np.tan(_FIELD / 2.0)) * aspect
         with client.atomic():
             client.camera.position = target + min(max(1.0, _ARMS / half_width), _FARTHEST) * _CAMERA_OFFSET
