@@ -169,8 +169,8 @@ class CalibrationStage(Stage):
         level, text, values = self.calibration.status()
         if self._exists and self.values["save"] and self._recorded >= _ODD_FRAMES:
             text += (
-                f"; {self._file} is not written: stamps are {self._recorded_s:.0f} s from the time of this computer, "
-                "as of a recording"
+                f"; {self._file} is not written, as the stamps are those of a recording: {self._recorded_s:.0f} s "
+                "from the time of this computer"
             )
         odd = [
             f"{sensor}: a trunk of {length:.3g} m, coordinates must be metres"

@@ -108,7 +108,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         description="Print a table of the joint angles in a recording with their standard deviations, and draw them. "
         "Where the recording holds the truth, errors are shown too.",
     )
-    parser.add_argument("bag", type=Path, help="a bag folder with joint angles, such as the output of replay")
+    parser.add_argument(
+        "bag", type=Path, metavar="BAG", help="a bag folder with joint angles, such as the output of replay"
+    )
     parser.add_argument("-o", "--output", type=Path, metavar="PNG", help="draw a picture into this file")
     parser.add_argument(
         "--csv", type=Path, metavar="FILE", help="write each frame's angles and standard deviations, in degrees"

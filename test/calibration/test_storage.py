@@ -98,7 +98,7 @@ def test_a_recording_played_beside_changes_no_existing_file(tmp_path: Path, stam
     kept = existed and stamps == "of a recording"
     assert (path.read_text() == before) is kept
     text = stage.state(at_ns)[1]
-    assert ("room.yaml is not written: stamps are 3" in text) is kept
+    assert ("room.yaml is not written, as the stamps are those of a recording: 3" in text) is kept
 
 
 def test_frames_that_waited_during_a_standstill_are_those_of_a_sensor(tmp_path: Path) -> None:
