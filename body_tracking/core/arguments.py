@@ -36,7 +36,7 @@ class Parser(argparse.ArgumentParser):
             return f"; did you mean '--bag {unknown}'?"
         if (bare or bag) and self.about_bag:
             return f"; {self.about_bag}"
-        if bag and any(action.dest == "bag" for action in self._get_positional_actions()):
+        if bag and self._get_positional_actions():
             return "; the recording stands here without '--bag'"
         return did_you_mean(unknown, self._option_string_actions)
 

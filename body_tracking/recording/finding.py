@@ -12,6 +12,8 @@ import body_tracking
 from body_tracking.core.message_types import COMPRESSED_IMAGE, IMAGE, IMU, POINT_CLOUD
 from body_tracking.core.parameters import Value
 from body_tracking.markers import setup
+from body_tracking.pipeline.graph import SENSORS_INPUT
+from body_tracking.pipeline.roles import DEFAULT_FILTER, role_of
 from body_tracking.pipeline.system import Option
 from body_tracking.systems import OPTIONS
 
@@ -92,6 +94,18 @@ def unused(topics: Mapping[str, str], options: Mapping[str, Value]) -> str:
         if source not in taken and not any(each for each in given if isinstance(each, str)):
             left.setdefault(takers, set()).add(source)
     return "; ".join(f"{listed(takers, 'or')}: {', '.join(sorted(names))}" for takers, names in left.items())
+
+
+def unused_imus(options: Mapping[str, Value]) -> str:
+    """A line that says that the filter of a graph leaves out its inertial sensors; empty where something uses them.
+
+    Args:
+        options: of the graph.
+    """
+    alone = not options["sensors"]
+    if not options["imus"] or alone or options["depth"] or role_of(options).input == SENSORS_INPUT:
+        return ""
+    return f"the filter {options['filter'] or DEFAULT_FILTER} does not use the inertial sensors: --filter ekf does"
 
 
 def _option(flag: str) -> Option:

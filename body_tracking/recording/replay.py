@@ -33,7 +33,7 @@ from body_tracking.pipeline.people import SubjectSelector
 from body_tracking.pipeline.roles import ROLES
 from body_tracking.pipeline.system import Options
 from body_tracking.recording import forked
-from body_tracking.recording.finding import advice_for, unused
+from body_tracking.recording.finding import advice_for, unused, unused_imus
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, check_new_bag, deserialize
@@ -236,10 +236,10 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
         others = unused({name: each.type_name for name, each in bag.topics.items()}, settings.options())
         kept = tuple(dict.fromkeys((*topics, *truth, *sources)))
         passed = {topic: (bag.topics[topic].type_name, bag.topics[topic].qos) for topic in kept}
-        notes = []
+        notes = [unused_imus(settings.options())]
         if settings.calibration_file is not None:
             lack = lacking(load(settings.calibration_file), settings.sensors)  # raises if it is missing or invalid
-            notes = [f"{settings.calibration_file}{lack}"] if lack else []
+            notes += [f"{settings.calibration_file}{lack}"] if lack else []
         all_stages = settings.stages()
         # the stages may raise: construct them before `out` is replaced
         first = {each.node: each.make() for each in all_stages if not forked.is_second(each.executable)}
@@ -287,7 +287,7 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
             (bag.end_ns - bag.start_ns) / NANOSECONDS,
             time.perf_counter() - began,
             {name: count for name, count in sorted(counters.items()) if count},
-            (*bag.warnings, *notes, *problems),
+            (*bag.warnings, *filter(None, notes), *problems),
             others,
         )
 

@@ -38,7 +38,7 @@ from body_tracking.node_parameters import parameters_for
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.shared import names_in
 from body_tracking.pipeline.system import NodeSpec, Options
-from body_tracking.recording.finding import advice_for, unused
+from body_tracking.recording.finding import advice_for, unused, unused_imus
 from body_tracking.recording.rig import RigReader
 from body_tracking.robot.system import convention_of
 from body_tracking.ros import dds
@@ -615,6 +615,8 @@ def supervise(
     specs = nodes_for(options)
     if any(spec.parameters.get("save") is False for spec in specs):
         print(f"{options['calibration']}: only loaded, as a bag plays", flush=True)
+    if note := unused_imus(options):
+        print(f"note: {note}", flush=True)
     if args.bag is not None:
         with RigReader(args.bag) as reader:
             others = unused({name: each.type_name for name, each in reader.topics.items()}, options)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from body_tracking.core.message_types import COMPRESSED_IMAGE, IMAGE, IMU, JOINT_STATE, POINT_CLOUD
-from body_tracking.recording.finding import advice_for, unused
+from body_tracking.recording.finding import advice_for, unused, unused_imus
+from body_tracking.systems import options_of
 
 FIVE = {
     "/kinect1/skeleton": POINT_CLOUD,
@@ -35,6 +38,22 @@ MARKERS = {"/left/balls": POINT_CLOUD, "/right/balls": POINT_CLOUD, "/markers/po
 )
 def test_sources_that_a_graph_leaves_out_are_named(options: dict[str, str | tuple[str, ...]], left: str) -> None:
     assert unused(FIVE, options) == left
+
+
+@pytest.mark.parametrize(
+    ("options", "used"),
+    [
+        ({}, False),
+        ({"filter": "lkf_zero_velocity"}, False),
+        ({"filter": "ekf"}, True),
+        ({"sensors": ()}, True),  # ekf by default
+        ({"depth": ("kinect1",)}, True),  # by the mesh
+        ({"imus": ()}, True),  # there are none
+    ],
+)
+def test_a_filter_that_does_not_use_the_inertial_sensors_is_named(options: dict[str, Any], used: bool) -> None:
+    note = unused_imus(options_of(**{"sensors": ("kinect1",), "imus": ("forearm_left",), **options}))
+    assert note == "" if used else note.startswith("the filter lkf_") and note.endswith(": --filter ekf does")
 
 
 def test_only_options_that_fit_the_images_are_advised() -> None:
