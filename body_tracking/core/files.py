@@ -66,20 +66,20 @@ def open_regular(path: Path) -> BinaryIO:
         raise
 
 
-def read_text(path: Path, limit: int = MAX_BYTES) -> str:
+def read_text(path: Path) -> str:
     """A text file in UTF-8.
 
     Raises:
         FileError: it cannot be read, is no regular file, or no text.
-        FileLimitError: it is larger than the limit, bytes.
+        FileLimitError: it is larger than :data:`MAX_BYTES`.
     """
     try:
         with open_regular(path) as file:
-            data = file.read(limit + 1)
+            data = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise FileError(f"cannot be read ({error.strerror or error})") from error
-    if len(data) > limit:
-        raise FileLimitError(f"cannot be read (more than {limit >> 20} MB)")
+    if len(data) > MAX_BYTES:
+        raise FileLimitError(f"cannot be read (more than {MAX_BYTES >> 20} MB)")
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:

@@ -26,7 +26,6 @@ from body_tracking.pipeline import graph
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BagReader, RawMessage, deserialize
 
-_PREFIX, _SUFFIX = "/humans/bodies/", "/joint_states"
 _MATCH_NS = NANOSECONDS // 50
 _RENAMED = {"trunk_lateral_lean": "trunk_lateral_flexion", "trunk_axial_lean": "trunk_axial_rotation"}
 """Former names, which the shipped recordings have."""
@@ -165,7 +164,9 @@ def read(path: Path, body: str | None = None, truth: Path | None = None) -> Trac
     """
     with RigReader(path) as bag:
         if not bodies(bag):
-            raise EvaluationError(f"{path}: holds no joint angles ({_PREFIX}<id>{_SUFFIX}); make some with replay")
+            raise EvaluationError(
+                f"{path}: holds no joint angles ({graph.joint_states_topic('<id>')}); make some with replay"
+            )
         body, angles = read_angles(bag, body)
         skeletons = read_skeletons(bag, graph.FILTERED)
     if truth is not None:
@@ -254,12 +255,8 @@ def model_angles(states: Iterable[ModelEstimate], model: UpperBody, name: str) -
 
 def bodies(bag: BagReader) -> tuple[str, ...]:
     """The ids of people with joint angles in a bag, sorted."""
-    return tuple(
-        sorted(
-            topic.removeprefix(_PREFIX).removesuffix(_SUFFIX)
-            for topic, info in bag.topics.items()
-            if topic.startswith(_PREFIX) and topic.endswith(_SUFFIX) and info.type_name == JOINT_STATE and info.count
-        )
+    return graph.bodies_among(
+        topic for topic, info in bag.topics.items() if info.type_name == JOINT_STATE and info.count
     )
 
 

@@ -20,7 +20,7 @@ from body_tracking.core.skeleton import FloatArray
 from body_tracking.mesh.body_model import Body, BodyModel, Pose
 from body_tracking.mesh.energy import Observation
 from body_tracking.mesh.skinning import lever_arms
-from body_tracking.mesh.solver import Fit, MeshFitter, Settings
+from body_tracking.mesh.solver import Fit, MeshFitter
 from body_tracking.mesh.uncertainty import joint_shape_gradients, point_shape_gradients, pose_rows
 
 SCALES: Final = (0.1, 0.1, 0.06, 0.06, 0.03, 0.03, 0.03, 0.03)
@@ -92,7 +92,6 @@ def personalise(
     model: BodyModel,
     observations: Sequence[Observation],
     starts: Sequence[Pose] | None = None,
-    settings: Settings | None = None,
 ) -> Person:
     """Estimate the shape of the person in all images (Jatesiktat 2018, figure 2 and section III-B, on several images).
 
@@ -100,7 +99,6 @@ def personalise(
         model: shape space.
         observations: of 4 to 8 images in different poses; with fewer the prior dominates the shape.
         starts: initial pose of each; None to search for them.
-        settings: standard deviations of the terms.
 
     Raises:
         PersonalisationError: no image, or the fit is lost in more than half of them.
@@ -111,7 +109,7 @@ def personalise(
     for stature in STATURES:
         shape = np.zeros(model.vertex_shapes.shape[2])
         shape[0] = stature
-        fitter = MeshFitter(model.body(shape), settings)
+        fitter = MeshFitter(model.body(shape))
         poses = starts if starts is not None else [fitter.search(seen).pose for seen in observations]
         found = _refined(fitter, observations, poses)
         if best is None or found[0] < best[0]:
@@ -143,7 +141,7 @@ def _refined(
         step *= min(1.0, 1.0 / max(float(np.abs(step).max()), 1e-9))
         poses = [fitter.moved(s.fit.pose, _bounded(-s.solved_gradient - s.solved @ step)) for s in systems]
         shape = shape + step
-        fitter = MeshFitter(fitter.body.model.body(shape), fitter.settings)
+        fitter = MeshFitter(fitter.body.model.body(shape))
     fits = tuple(fitter.fit(seen, pose, scales=SCALES[-2:]) for seen, pose in zip(observations, poses, strict=True))
     total = sum(fit.energy for fit in fits) + 0.5 * float(shape @ shape)
     return total, fitter.body, fits, information

@@ -114,17 +114,15 @@ def write_arm(
         progress.end()
 
 
-def write_pendulum(
-    scene: PendulumScene, folder: Path, seconds: float, *, camera: str = CAMERA, overwrite: bool = False
-) -> None:
+def write_pendulum(scene: PendulumScene, folder: Path, seconds: float, *, overwrite: bool = False) -> None:
     """Write a pendulum's swing as a bag: infrared and depth images with their calibration.
 
     Raises:
         BagError: the folder exists and ``overwrite`` is false, or it cannot be written.
     """
     rng = np.random.default_rng([scene.seed, 62])
-    infrared, depth = infrared_topic(camera), DRIVERS["plain"].of(camera).depth
-    own = replace(scene.camera, frame_id=optical_frame(camera))
+    infrared, depth = infrared_topic(CAMERA), DRIVERS["plain"].of(CAMERA).depth
+    own = replace(scene.camera, frame_id=optical_frame(CAMERA))
     with BagWriter(folder, overwrite=overwrite, chunk_bytes=IMAGE_CHUNK_BYTES, flush_interval_s=float("inf")) as bag:
         for topic in (infrared, depth):
             bag.add_topic(topic, IMAGE, IMAGES)

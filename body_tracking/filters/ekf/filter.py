@@ -60,9 +60,9 @@ class ExtendedKalmanFilter:
         counters: events since the construction, for diagnostics.
     """
 
-    def __init__(self, parameters: EkfParameters | None = None, model: CompiledUpperBody | None = None) -> None:
+    def __init__(self, parameters: EkfParameters | None = None) -> None:
         self.parameters = p = parameters or EkfParameters()
-        self.model = model or CompiledUpperBody()
+        self.model = CompiledUpperBody()
         self.counters: dict[str, int] = dict.fromkeys(
             (
                 "frames",
