@@ -13,8 +13,8 @@ from body_tracking.core.message_types import COMPRESSED_IMAGE, IMAGE
 from body_tracking.core.skeleton import SingleArray
 from body_tracking.mesh.depth import DepthError, to_metres
 from body_tracking.messages.base import MessageError, to_header, to_nanoseconds
-from body_tracking.messages.codecs import Codec, Wire
-from body_tracking.messages.images import MAX_PIXELS, array_to_image, to_rgb
+from body_tracking.messages.codecs import Codec, Image, Wire
+from body_tracking.messages.images import MAX_PIXELS, to_rgb
 
 Colour = tuple[int, str, NDArray[np.uint8]]
 """Stamp in nanoseconds, frame, (height, width, 3) red, green, blue."""
@@ -27,20 +27,13 @@ _DEPTH_HEADER: Final = struct.Struct("<iff")
 quantised metres, which are not used with it (compressed_depth_image_transport)."""
 
 
-class ColourImage(Codec):
+class ColourImage(Image):
     """``sensor_msgs/Image`` in colour."""
 
-    type_name = IMAGE
-
-    def encode(self, payload: Colour, wire: Wire) -> bytes:
-        stamp_ns, frame_id, pixels = payload
-        return wire.serialize(IMAGE, array_to_image(pixels, stamp_ns, frame_id, wire.types, "rgb8"))
+    encoding = "rgb8"
 
     def decode(self, cdr: bytes, wire: Wire) -> Colour:
         return to_rgb(wire.deserialize(IMAGE, cdr))
-
-    def stamp_ns(self, payload: Colour) -> int:
-        return payload[0]
 
 
 class CompressedColour(Codec):

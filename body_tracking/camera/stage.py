@@ -25,10 +25,10 @@ from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import NANOSECONDS, SingleArray, Skeleton
 from body_tracking.core.sources import check_sensor_name, optical_frame
 from body_tracking.markers.pairing import FrameSets
-from body_tracking.mesh.codecs import DepthImage, DepthInfo
+from body_tracking.mesh.codecs import DepthImage
 from body_tracking.mesh.depth import DepthError, check_size
 from body_tracking.mesh.person import COVERED, is_covered
-from body_tracking.messages.codecs import Skeletons
+from body_tracking.messages.codecs import CameraInfo, Skeletons
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.shared import RELIABLE as TRANSPORT
 from body_tracking.pipeline.shared import names_in, skeleton_qos
@@ -107,7 +107,7 @@ class CameraStage(Stage):
         self.inputs = (
             image_port(colour, ColourImage() if compressed == "none" else CompressedColour(), values),
             image_port(depth, CompressedDepth() if compressed == "both" else DepthImage(), values),
-            *(Port(topic, DepthInfo(), LATCHED, foreign=True) for topic in (topics.colour_info, topics.depth_info)),
+            *(Port(topic, CameraInfo(), LATCHED, foreign=True) for topic in (topics.colour_info, topics.depth_info)),
         )
         self._skeletons = graph.skeleton_topic(self._name)
         self.outputs = (

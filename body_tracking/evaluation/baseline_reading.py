@@ -21,9 +21,9 @@ from body_tracking.evaluation.balls import bright_balls, red_balls
 from body_tracking.evaluation.reading import EvaluationError
 from body_tracking.evaluation.robot_arm import BALLS, Trial
 from body_tracking.markers.camera_images import DriverCodec, DriverImage
-from body_tracking.mesh.codecs import DepthImage, DepthInfo
+from body_tracking.mesh.codecs import DepthImage
 from body_tracking.messages.base import MessageError
-from body_tracking.messages.codecs import Codec
+from body_tracking.messages.codecs import CameraInfo, Codec
 from body_tracking.messages.points import pose_array_to_points
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rig import RigReader
@@ -75,7 +75,7 @@ def _decoded(path: Path, topic: str, codec: Codec, cdr: bytes) -> Any:
 
 def _camera(bag: RigReader, path: Path, topic: str) -> Camera:
     """The first calibration on a topic."""
-    codec = DepthInfo()
+    codec = CameraInfo()
     _source(bag, path, {topic: codec})
     for raw in bag.messages([topic]):
         camera: Camera = _decoded(path, topic, codec, raw.cdr)

@@ -18,10 +18,10 @@ from body_tracking.core.parameters import Parameter, Value
 from body_tracking.core.qos import LATCHED, Qos
 from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.markers import setup
-from body_tracking.markers.codecs import CameraImage, Info
+from body_tracking.markers.codecs import CameraImage
 from body_tracking.markers.pairing import FrameSets
 from body_tracking.markers.rig_storage import load_rig
-from body_tracking.messages.codecs import Codec, Wire
+from body_tracking.messages.codecs import CameraInfo, Codec, Wire
 from body_tracking.messages.images import to_mono
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
 from body_tracking.pipeline.system import load
@@ -168,7 +168,7 @@ class CameraImagesStage(Stage):
         qos = Qos(reliability="best_effort", depth=10) if values["best_effort"] else IMAGES
         self.inputs = tuple(Port(topic, DriverCodec(), qos, perishable=True, absolute=True) for topic in self._topics)
         self.outputs = tuple(Port(setup.image_topic(frame), CameraImage(), IMAGES, measured=True) for frame in frames)
-        self.outputs += tuple(Port(setup.info_topic(frame), Info(), LATCHED) for frame in frames)
+        self.outputs += tuple(Port(setup.info_topic(frame), CameraInfo(), LATCHED) for frame in frames)
 
     def start(self, now: Now) -> Iterable[Output]:
         self._begun = now

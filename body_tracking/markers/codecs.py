@@ -8,7 +8,6 @@ from typing import Any
 from numpy.typing import NDArray
 
 from body_tracking.core import so3
-from body_tracking.core.camera import Camera
 from body_tracking.core.message_types import IMAGE, POINT_CLOUD, TF, TRANSFORM
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.markers.messages import (
@@ -22,37 +21,15 @@ from body_tracking.markers.messages import (
 )
 from body_tracking.markers.observations import ImageBalls, Points, TargetPose
 from body_tracking.messages.base import to_header, to_transform
-from body_tracking.messages.cameras import CAMERA_INFO, camera_to_info, info_to_camera
-from body_tracking.messages.codecs import Codec, Wire
-from body_tracking.messages.images import array_to_image, image_to_array
+from body_tracking.messages.codecs import Codec, Image, Wire
+from body_tracking.messages.images import image_to_array
 
 
-class CameraImage(Codec):
+class CameraImage(Image):
     """A monochrome image: stamp in nanoseconds, frame, (height, width) pixels."""
-
-    type_name = IMAGE
-
-    def encode(self, payload: tuple[int, str, NDArray[Any]], wire: Wire) -> bytes:
-        stamp_ns, frame_id, pixels = payload
-        return wire.serialize(IMAGE, array_to_image(pixels, stamp_ns, frame_id, wire.types))
 
     def decode(self, cdr: bytes, wire: Wire) -> tuple[int, str, NDArray[Any]]:
         return image_to_array(wire.deserialize(IMAGE, cdr))
-
-    def stamp_ns(self, payload: tuple[int, str, NDArray[Any]]) -> int:
-        return payload[0]
-
-
-class Info(Codec):
-    """The calibration of a camera: stamp in nanoseconds, and camera."""
-
-    type_name = CAMERA_INFO
-
-    def encode(self, payload: tuple[int, Camera], wire: Wire) -> bytes:
-        return wire.serialize(CAMERA_INFO, camera_to_info(payload[1], payload[0], wire.types))
-
-    def decode(self, cdr: bytes, wire: Wire) -> Camera:
-        return info_to_camera(wire.deserialize(CAMERA_INFO, cdr))
 
 
 class Balls(Codec):

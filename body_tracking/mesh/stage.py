@@ -20,7 +20,7 @@ from body_tracking.fusion.stage import calibration_inputs
 from body_tracking.mesh import body_model, storage
 from body_tracking.mesh.body_index import IndexArray, IndexPairs
 from body_tracking.mesh.body_model import Body
-from body_tracking.mesh.codecs import BodyIndex, DepthImage, DepthInfo, MeshMarker
+from body_tracking.mesh.codecs import BodyIndex, DepthImage, MeshMarker
 from body_tracking.mesh.depth import DepthCamera, DepthError
 from body_tracking.mesh.person import COVERED
 from body_tracking.mesh.personalisation import DistinctPoses, PersonalisationError, personalise
@@ -35,7 +35,7 @@ from body_tracking.mesh.topics import (
     personalise_service,
 )
 from body_tracking.mesh.tracking import MeshTracker, Tracked, TrackerParameters, prepare
-from body_tracking.messages.codecs import Orientation, SensorClock, Skeletons
+from body_tracking.messages.codecs import CameraInfo, Orientation, SensorClock, Skeletons
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.shared import RELIABLE as TRANSPORT
 from body_tracking.pipeline.shared import names_in, skeleton_qos
@@ -99,7 +99,7 @@ class MeshStage(Stage):
         prepare()
         reliable = bool(values["reliable"])
         self._info, self._images, self._bodies = info_topic(camera), depth_topic(camera), body_index_topic(camera)
-        inputs = [Port(self._info, DepthInfo(), LATCHED, foreign=True)]
+        inputs = [Port(self._info, CameraInfo(), LATCHED, foreign=True)]
         inputs += [
             Port(
                 *(topic, codec, IMAGES, _KEPT if reliable else 0),

@@ -8,7 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
+from numpy.typing import NDArray
+
 from body_tracking.core.body_model import BodyModel
+from body_tracking.core.camera import Camera
 from body_tracking.core.clocks import ClockModel
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.imu import ImuSample
@@ -35,7 +38,9 @@ from body_tracking.messages.calibration import (
     time_reference_to_clock,
     transform_to_pose,
 )
+from body_tracking.messages.cameras import CAMERA_INFO, camera_to_info, info_to_camera
 from body_tracking.messages.cdr import decode_skeletons, encode_skeletons
+from body_tracking.messages.images import array_to_image
 from body_tracking.messages.imus import (
     message_to_magnetic_field,
     message_to_orientation,
@@ -85,6 +90,36 @@ class Codec:
     def stamp_ns(self, payload: Any) -> int | None:
         """Capture time, for the detection of backward jumps; None for contents without one."""
         return None
+
+
+class Image(Codec):
+    """Base of the codecs of ``sensor_msgs/Image``: stamp in nanoseconds, frame, pixels.
+
+    Attributes:
+        encoding: in which it is written; empty for ``mono8`` or ``mono16``, by the size of a number.
+    """
+
+    type_name = IMAGE
+    encoding = ""
+
+    def encode(self, payload: tuple[int, str, NDArray[Any]], wire: Wire) -> bytes:
+        stamp_ns, frame_id, pixels = payload
+        return wire.serialize(IMAGE, array_to_image(pixels, stamp_ns, frame_id, wire.types, self.encoding))
+
+    def stamp_ns(self, payload: tuple[int, str, NDArray[Any]]) -> int:
+        return payload[0]
+
+
+class CameraInfo(Codec):
+    """The calibration of a camera; written with a stamp in nanoseconds."""
+
+    type_name = CAMERA_INFO
+
+    def encode(self, payload: tuple[int, Camera], wire: Wire) -> bytes:
+        return wire.serialize(CAMERA_INFO, camera_to_info(payload[1], payload[0], wire.types))
+
+    def decode(self, cdr: bytes, wire: Wire) -> Camera:
+        return info_to_camera(wire.deserialize(CAMERA_INFO, cdr))
 
 
 class Skeletons(Codec):

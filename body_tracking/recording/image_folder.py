@@ -33,9 +33,9 @@ from body_tracking.core.message_types import COMPRESSED_IMAGE
 from body_tracking.core.qos import LATCHED
 from body_tracking.core.skeleton import MAX_STAMP_NS, NANOSECONDS
 from body_tracking.core.sources import check_sensor_name, optical_frame
-from body_tracking.mesh.codecs import DepthInfo
 from body_tracking.mesh.topics import IMAGES
 from body_tracking.messages.cameras import CAMERA_INFO
+from body_tracking.messages.codecs import CameraInfo
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagWriter
 
@@ -130,7 +130,7 @@ def import_folder(
         for topic in dict.fromkeys(topic for _, topic, _ in images):
             bag.add_topic(topic, COMPRESSED_IMAGE, IMAGES)
         for topic, each in infos.items():
-            bag.write(topic, DepthInfo().encode((first_ns, each), BAG_WIRE), first_ns)
+            bag.write(topic, CameraInfo().encode((first_ns, each), BAG_WIRE), first_ns)
         for number, (stamp_ns, topic, path) in enumerate(images):
             data = _data(path)
             if topic.endswith(COMPRESSED):

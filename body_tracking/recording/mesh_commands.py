@@ -16,11 +16,12 @@ from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.files import check_new
 from body_tracking.core.parameters import check_all
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
-from body_tracking.mesh.codecs import DepthImage, DepthInfo, MeshMarker
+from body_tracking.mesh.codecs import DepthImage, MeshMarker
 from body_tracking.mesh.picture import overlay
 from body_tracking.mesh.stage import MeshStage
 from body_tracking.mesh.topics import body_index_topic, depth_topic, info_topic, mesh_topic
 from body_tracking.messages.cdr import stamp_of
+from body_tracking.messages.codecs import CameraInfo
 from body_tracking.pipeline.offline import OfflineRunner
 from body_tracking.recording.picture import write_picture
 from body_tracking.recording.progress import Progress
@@ -95,7 +96,7 @@ def pictures(recording: Path, camera: str, count: int) -> list[NDArray[np.uint8]
     with RigReader(recording) as bag:
         for topic, cdr, _ in _messages(bag, camera, mesh_topic(camera)):
             if topic == info_topic(camera):
-                info = DepthInfo().decode(cdr, BAG_WIRE)
+                info = CameraInfo().decode(cdr, BAG_WIRE)
             elif topic == mesh_topic(camera):
                 stamp_ns, _, corners = MeshMarker().decode(cdr, BAG_WIRE)
                 meshes[stamp_ns] = corners

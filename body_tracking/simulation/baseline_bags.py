@@ -22,9 +22,10 @@ from body_tracking.core.qos import LATCHED, RELIABLE
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.core.sources import optical_frame
 from body_tracking.markers.codecs import CameraImage
-from body_tracking.mesh.codecs import DepthImage, DepthInfo
+from body_tracking.mesh.codecs import DepthImage
 from body_tracking.mesh.topics import IMAGES
 from body_tracking.messages.cameras import CAMERA_INFO
+from body_tracking.messages.codecs import CameraInfo
 from body_tracking.messages.points import points_to_pose_array
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, BagWriter, serialize
@@ -143,7 +144,7 @@ def write_pendulum(scene: PendulumScene, folder: Path, seconds: float, *, overwr
 
 
 def _write_info(bag: BagWriter, topic: str, camera: Camera) -> None:
-    bag.write(topic, DepthInfo().encode((START_NS, camera), BAG_WIRE), START_NS)
+    bag.write(topic, CameraInfo().encode((START_NS, camera), BAG_WIRE), START_NS)
 
 
 def _received(stamp_ns: int) -> int:

@@ -25,10 +25,11 @@ from body_tracking.core.sources import optical_frame
 from body_tracking.markers import setup
 from body_tracking.markers.rig import LENS, POSE, Rig
 from body_tracking.markers.rig_storage import save_rig
-from body_tracking.mesh.codecs import DepthImage, DepthInfo
+from body_tracking.mesh.codecs import DepthImage
 from body_tracking.mesh.topics import IMAGES
 from body_tracking.messages.calibration import pose_to_transform
 from body_tracking.messages.cameras import CAMERA_INFO
+from body_tracking.messages.codecs import CameraInfo
 from body_tracking.pipeline import graph
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, serialize
@@ -144,7 +145,7 @@ def camera_messages(scene: DepthScene, seconds: float, *, truth: bool) -> Iterat
     """The images of a colour-and-depth camera, with progress on stderr; ``truth``: also the ground truth."""
     painter, names = Painter.of(scene, colour_camera(_WIDTH)), DRIVERS["plain"].of(CAMERA)
     for topic, camera in ((names.colour_info, painter.camera), (names.depth_info, scene.camera)):
-        yield RECEIVED_FROM_NS, topic, DepthInfo().encode((START_NS, camera), BAG_WIRE)
+        yield RECEIVED_FROM_NS, topic, CameraInfo().encode((START_NS, camera), BAG_WIRE)
     if truth:
         yield _true_pose(scene.pose)
     progress = Progress(0, round(seconds * RATE) // EVERY)

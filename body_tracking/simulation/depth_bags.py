@@ -21,11 +21,12 @@ from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Skele
 from body_tracking.inertial.simulated import SimulatedImu, usual_mounting
 from body_tracking.inertial.surroundings import Surroundings
 from body_tracking.kinect.simulated_sensor import Misreading, SimulatedKinect
-from body_tracking.mesh.codecs import DepthImage, DepthInfo
+from body_tracking.mesh.codecs import DepthImage
 from body_tracking.mesh.topics import IMAGES, depth_topic, info_topic
 from body_tracking.messages.calibration import pose_to_transform
 from body_tracking.messages.cameras import CAMERA_INFO
 from body_tracking.messages.cdr import encode_skeletons
+from body_tracking.messages.codecs import CameraInfo
 from body_tracking.pipeline import graph
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, serialize
@@ -85,7 +86,7 @@ def write_depth_bag(scene: DepthScene, folder: Path, seconds: float, *, overwrit
     }
     pose = serialize(pose_to_transform(scene.pose, WORLD, BAG_MESSAGES))
     messages = [
-        (RECEIVED_FROM_NS, info_topic(SENSOR), DepthInfo().encode((START_NS, scene.camera), BAG_WIRE)),
+        (RECEIVED_FROM_NS, info_topic(SENSOR), CameraInfo().encode((START_NS, scene.camera), BAG_WIRE)),
         (RECEIVED_FROM_NS, graph.TRUE_CALIBRATION, pose),
         *inertial_messages(scene, seconds),
     ]

@@ -25,11 +25,12 @@ from body_tracking.markers.chain import JointDescription
 from body_tracking.markers.codecs import Balls
 from body_tracking.markers.detection import detect
 from body_tracking.markers.joint_model import Joint
-from body_tracking.mesh.codecs import DepthImage, DepthInfo
+from body_tracking.mesh.codecs import DepthImage
 from body_tracking.mesh.topics import IMAGES, depth_topic, info_topic
 from body_tracking.messages.calibration import pose_to_transform
 from body_tracking.messages.cameras import CAMERA_INFO
 from body_tracking.messages.cdr import encode_skeletons
+from body_tracking.messages.codecs import CameraInfo
 from body_tracking.pipeline import graph
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, serialize
@@ -111,7 +112,7 @@ def _on_the_left(joint: _Joint) -> _Joint:
 
 
 def _depth_and_truth(scene: DepthScene) -> Iterator[Message]:
-    info = DepthInfo().encode((START_NS, scene.camera), BAG_WIRE)
+    info = CameraInfo().encode((START_NS, scene.camera), BAG_WIRE)
     yield RECEIVED_FROM_NS, info_topic(SENSOR), info
     yield RECEIVED_FROM_NS, graph.TRUE_CALIBRATION, serialize(pose_to_transform(scene.pose, WORLD, BAG_MESSAGES))
     progress = Progress(0, round(SECONDS * RATE))

@@ -24,13 +24,14 @@ from body_tracking.markers.boards import Chessboard, Image
 from body_tracking.markers.camera_calibration import calibrate_cameras, find_boards
 from body_tracking.markers.chain import JointDescription
 from body_tracking.markers.chain_files import save_chain
-from body_tracking.markers.codecs import CameraImage, Info
+from body_tracking.markers.codecs import CameraImage
 from body_tracking.markers.rendering import RenderingError, Sensor, render, render_chessboard
 from body_tracking.markers.rig import Rig
 from body_tracking.markers.rig_storage import save_rig
 from body_tracking.markers.targets_file import save_targets
 from body_tracking.messages.base import to_header
 from body_tracking.messages.cameras import CAMERA_INFO
+from body_tracking.messages.codecs import CameraInfo
 from body_tracking.pipeline import graph
 from body_tracking.recording.marker_commands import fit_recording
 from body_tracking.recording.progress import Progress
@@ -70,7 +71,7 @@ def write_scene(scene: MarkerScene, output: Path, sensor: Sensor, seed: int, *, 
         for camera in scene.rig.cameras:
             bag.add_topic(setup.image_topic(camera.frame_id), IMAGE, RELIABLE)
             bag.add_topic(setup.info_topic(camera.frame_id), CAMERA_INFO, LATCHED)
-            bag.write(setup.info_topic(camera.frame_id), Info().encode((START_NS, camera), BAG_WIRE), START_NS)
+            bag.write(setup.info_topic(camera.frame_id), CameraInfo().encode((START_NS, camera), BAG_WIRE), START_NS)
         bag.add_topic(TRUE_ANGLES, JOINT_STATE, RELIABLE)
         progress = Progress(0, len(scene.times))
         angles = scene.angles()

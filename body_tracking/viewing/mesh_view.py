@@ -12,11 +12,11 @@ from body_tracking.core.camera import Camera
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.core.sources import check_sensor_name
-from body_tracking.mesh.codecs import DepthImage, DepthInfo, MeshMarker
+from body_tracking.mesh.codecs import DepthImage, MeshMarker
 from body_tracking.mesh.picture import outlined
 from body_tracking.mesh.topics import depth_topic, info_topic, mesh_sensor, mesh_topic
 from body_tracking.messages.cdr import stamp_of
-from body_tracking.messages.codecs import Codec
+from body_tracking.messages.codecs import CameraInfo, Codec
 from body_tracking.viewing.colours import Colour
 from body_tracking.viewing.handles import show
 from body_tracking.viewing.snapshot import Decode
@@ -62,7 +62,7 @@ class MeshView:
             if visible[_IMAGES] or visible[_MESH]:
                 found[mesh_topic(camera)] = MeshMarker()
             if visible[_IMAGES]:
-                found |= {depth_topic(camera): DepthImage(), info_topic(camera): DepthInfo()}
+                found |= {depth_topic(camera): DepthImage(), info_topic(camera): CameraInfo()}
         return found
 
     def start(self, server: Any) -> None:

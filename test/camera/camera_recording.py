@@ -14,9 +14,10 @@ from body_tracking.camera.topics import COMPRESSED, DRIVERS
 from body_tracking.core.camera import Camera
 from body_tracking.core.message_types import TRANSFORM
 from body_tracking.core.skeleton import FloatArray, SingleArray
-from body_tracking.mesh.codecs import DepthImage, DepthInfo
+from body_tracking.mesh.codecs import DepthImage
 from body_tracking.messages.calibration import transform_to_pose
 from body_tracking.messages.cdr import decode_skeletons
+from body_tracking.messages.codecs import CameraInfo
 from body_tracking.pipeline import graph
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, deserialize
 from body_tracking.simulation.camera_bags import SHIPPED
@@ -51,7 +52,7 @@ def recording() -> Recorded:
                 stamp_ns, _, distances = DepthImage().decode(raw.cdr, BAG_WIRE)
                 depth[stamp_ns] = distances
             elif raw.topic in (NAMES.colour_info, NAMES.depth_info):
-                cameras[raw.topic] = DepthInfo().decode(raw.cdr, BAG_WIRE)
+                cameras[raw.topic] = CameraInfo().decode(raw.cdr, BAG_WIRE)
             elif raw.topic == graph.TRUE_SKELETON:
                 (skeleton,) = decode_skeletons(raw.cdr) or ()
                 truth[skeleton.stamp_ns] = skeleton.positions

@@ -8,10 +8,11 @@ from typing import NamedTuple
 
 from body_tracking.core.camera import Camera
 from body_tracking.core.skeleton import FloatArray, SingleArray
-from body_tracking.mesh.codecs import DepthImage, DepthInfo
+from body_tracking.mesh.codecs import DepthImage
 from body_tracking.mesh.topics import depth_topic, info_topic
 from body_tracking.messages.calibration import transform_to_pose
 from body_tracking.messages.cdr import decode_skeletons
+from body_tracking.messages.codecs import CameraInfo
 from body_tracking.pipeline import graph
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader
 from body_tracking.simulation.depth_bags import SHIPPED
@@ -35,7 +36,7 @@ def recording() -> Recording:
     with BagReader(BAG) as bag:
         for raw in bag.messages():
             if raw.topic == info_topic(SENSOR):
-                camera = DepthInfo().decode(raw.cdr, BAG_WIRE)
+                camera = CameraInfo().decode(raw.cdr, BAG_WIRE)
             elif raw.topic == depth_topic(SENSOR):
                 stamp_ns, frame, images[stamp_ns] = DepthImage().decode(raw.cdr, BAG_WIRE)
                 assert camera is not None and frame == camera.frame_id

@@ -15,7 +15,7 @@ from body_tracking.core.qos import LATCHED
 from body_tracking.core.skeleton import Joint, SingleArray
 from body_tracking.mesh import body_model
 from body_tracking.mesh.body_index import NO_BODY, IndexArray, IndexPairs, of_body_index
-from body_tracking.mesh.codecs import BodyIndex, DepthImage, DepthInfo
+from body_tracking.mesh.codecs import BodyIndex, DepthImage
 from body_tracking.mesh.depth import DepthCamera, DepthError
 from body_tracking.mesh.person import COVERED, PersonFinder
 from body_tracking.mesh.raster import render
@@ -26,6 +26,7 @@ from body_tracking.mesh.topics import body_index_topic, depth_topic, info_topic
 from body_tracking.messages.base import MessageError
 from body_tracking.messages.cameras import CAMERA_INFO
 from body_tracking.messages.cdr import decode_skeletons
+from body_tracking.messages.codecs import CameraInfo
 from body_tracking.messages.images import array_to_image
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.stage import Now
@@ -272,7 +273,7 @@ def test_a_bag_with_body_index_images_is_replayed_with_them(tmp_path: Path) -> N
         bag.add_topic(INFO, CAMERA_INFO, LATCHED)
         for topic in (IMAGES, BODIES):
             bag.add_topic(topic, IMAGE, IMAGES_QOS)
-        bag.write(INFO, DepthInfo().encode((STAMPS[0], recording().camera), BAG_WIRE), STAMPS[0])
+        bag.write(INFO, CameraInfo().encode((STAMPS[0], recording().camera), BAG_WIRE), STAMPS[0])
         for number in range(COUNT):
             stamp, (depth, index) = STAMPS[number], two_people(number, 0.42, 2.3)
             millimetres = np.round(1e3 * depth).astype(np.uint16)

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from depth_shapes import camera
 
-from body_tracking.mesh.codecs import BodyIndex, DepthImage, DepthInfo
+from body_tracking.mesh.codecs import BodyIndex, DepthImage
 from body_tracking.messages.base import MessageError
+from body_tracking.messages.codecs import CameraInfo
 from body_tracking.messages.images import DEPTH, array_to_image, image_to_array
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE
 
@@ -65,7 +66,7 @@ def test_body_index_and_calibration_come_back() -> None:
     with pytest.raises(MessageError, match="encoding 'mono16', expected one of mono8, 8UC1"):
         BodyIndex().decode(BodyIndex().encode((STAMP_NS, "k", MILLIMETRES), BAG_WIRE), BAG_WIRE)
     own = camera(k1=0.09)
-    found = DepthInfo().decode(DepthInfo().encode((STAMP_NS, own), BAG_WIRE), BAG_WIRE)
+    found = CameraInfo().decode(CameraInfo().encode((STAMP_NS, own), BAG_WIRE), BAG_WIRE)
     assert (found.frame_id, found.width, found.height) == (own.frame_id, own.width, own.height)
     np.testing.assert_array_equal(found.matrix, own.matrix)
     np.testing.assert_array_equal(found.distortion, own.distortion)

@@ -15,7 +15,7 @@ from body_tracking.core.imu import RecordedImu
 from body_tracking.core.protobuf import ProtobufError, fields, signed
 from body_tracking.core.skeleton import NANOSECONDS, Joint, TrackingState
 from body_tracking.core.sources import RecordedFrame
-from body_tracking.mesh.codecs import BodyIndex, DepthImage, DepthInfo
+from body_tracking.mesh.codecs import BodyIndex, DepthImage
 from body_tracking.mesh.ntu_mocap import (
     HEIGHT,
     WIDTH,
@@ -26,6 +26,7 @@ from body_tracking.mesh.ntu_mocap import (
     is_ntu_mocap,
 )
 from body_tracking.mesh.topics import body_index_topic, depth_topic, info_topic
+from body_tracking.messages.codecs import CameraInfo
 from body_tracking.recording.importer import import_files
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader
 
@@ -185,7 +186,7 @@ def test_the_bag_has_what_a_depth_camera_publishes(folder: Path, tmp_path: Path)
     stamp_ns, frame_id, depth = DepthImage().decode(found[depth_topic("kinect1")][1], BAG_WIRE)
     assert stamp_ns == round(1033.4e-3 * NANOSECONDS) and depth[100, WIDTH - 401] == pytest.approx(1.002)
     assert BodyIndex().decode(found[body_index_topic("kinect1")][1], BAG_WIRE)[0] == stamp_ns
-    camera = DepthInfo().decode(found[info_topic("kinect1")][0], BAG_WIRE)
+    camera = CameraInfo().decode(found[info_topic("kinect1")][0], BAG_WIRE)
     assert camera.frame_id == frame_id and camera.matrix[0, 2] == pytest.approx(WIDTH - 1 - 260.0)
     assert {"/kinect1/skeleton", "/imu_camera/imu/data_raw", "/imu_forearm_right/imu/mag", "/markers/points"} <= set(
         found

@@ -15,10 +15,11 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # noqa: E402
 
 from body_tracking.core.camera import Camera  # noqa: E402
 from body_tracking.mesh import body_model  # noqa: E402
-from body_tracking.mesh.codecs import BodyIndex, DepthImage, DepthInfo  # noqa: E402
+from body_tracking.mesh.codecs import BodyIndex, DepthImage  # noqa: E402
 from body_tracking.mesh.raster import render  # noqa: E402
 from body_tracking.mesh.solver import MeshFitter  # noqa: E402
 from body_tracking.mesh.topics import body_index_topic, depth_topic, info_topic, mesh_sensor  # noqa: E402
+from body_tracking.messages import codecs  # noqa: E402
 from body_tracking.messages.skeletons import cloud_to_skeletons  # noqa: E402
 from body_tracking.pipeline.graph import skeleton_topic  # noqa: E402
 from body_tracking.recording.rosbag2 import BAG_WIRE  # noqa: E402
@@ -47,7 +48,7 @@ def test_images_and_calibrations_of_a_driver_that_starts_later_and_latches_nothi
         def capture() -> bool:
             nonlocal stamp_ns
             stamp_ns += 33_333_333
-            infos.publish(DepthInfo().encode((stamp_ns, CAMERA), BAG_WIRE))
+            infos.publish(codecs.CameraInfo().encode((stamp_ns, CAMERA), BAG_WIRE))
             images.publish(DepthImage().encode((stamp_ns, "camera", depth), BAG_WIRE))
             bodies.publish(BodyIndex().encode((stamp_ns, "camera", index), BAG_WIRE))
             return bool(found) and running.number("mesh_tracker", "images with a body index") > 0

@@ -14,7 +14,7 @@ from body_tracking import cli
 from body_tracking.camera.codecs import CompressedColour, CompressedDepth
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.message_types import COMPRESSED_IMAGE
-from body_tracking.mesh.codecs import DepthInfo
+from body_tracking.messages.codecs import CameraInfo
 from body_tracking.recording.image_folder import import_folder
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, deserialize
 
@@ -59,7 +59,7 @@ def test_images_stamps_and_intrinsics_are_in_the_bag(tmp_path: Path, capsys: pyt
                 stamp_ns, _, metres = CompressedDepth().decode(raw.cdr, BAG_WIRE)
                 depth[stamp_ns] = metres
             else:
-                infos[raw.topic] = DepthInfo().decode(raw.cdr, BAG_WIRE)
+                infos[raw.topic] = CameraInfo().decode(raw.cdr, BAG_WIRE)
     assert list(colour) == list(depth) == [int(stamp.replace(".", "")) * 1000 for stamp in STAMPS]
     assert [int(pixels[0, 0, 0]) for pixels in colour.values()] == [20, 80, 140]
     assert [float(metres[0, 0]) for metres in depth.values()] == pytest.approx([1.0, 1.1, 1.2])

@@ -13,13 +13,14 @@ from body_tracking.core.camera import Camera
 from body_tracking.core.message_types import IMAGE
 from body_tracking.core.qos import LATCHED, RELIABLE
 from body_tracking.mesh import body_model
-from body_tracking.mesh.codecs import DepthImage, DepthInfo, MeshMarker
+from body_tracking.mesh.codecs import DepthImage, MeshMarker
 from body_tracking.mesh.picture import overlay
 from body_tracking.mesh.raster import render
 from body_tracking.mesh.solver import MeshFitter
 from body_tracking.mesh.storage import load
 from body_tracking.mesh.topics import IMAGES, depth_topic, info_topic, mesh_topic
 from body_tracking.messages.cameras import CAMERA_INFO
+from body_tracking.messages.codecs import CameraInfo
 from body_tracking.messages.markers import MARKER
 from body_tracking.recording.picture import PictureError, write_picture
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagWriter
@@ -52,7 +53,7 @@ def test_show_draws_images_that_have_a_mesh(tmp_path: Path, capsys: pytest.Captu
         bag.add_topic(info_topic("kinect1"), CAMERA_INFO, LATCHED)
         bag.add_topic(depth_topic("kinect1"), IMAGE, IMAGES)
         bag.add_topic(mesh_topic("kinect1"), MARKER, RELIABLE)
-        bag.write(info_topic("kinect1"), DepthInfo().encode((0, CAMERA), BAG_WIRE), 1)
+        bag.write(info_topic("kinect1"), CameraInfo().encode((0, CAMERA), BAG_WIRE), 1)
         for stamp in range(10, 15):
             bag.write(depth_topic("kinect1"), DepthImage().encode((stamp, "camera", depth), BAG_WIRE), stamp)
         for stamp in (10, 12, 14):
@@ -94,7 +95,7 @@ def test_a_recording_without_depth_images_or_with_too_few_poses_says_so(
     with BagWriter(folder) as bag:
         bag.add_topic(info_topic("kinect1"), CAMERA_INFO, LATCHED)
         bag.add_topic(depth_topic("kinect1"), IMAGE, IMAGES)
-        bag.write(info_topic("kinect1"), DepthInfo().encode((0, CAMERA), BAG_WIRE), 1)
+        bag.write(info_topic("kinect1"), CameraInfo().encode((0, CAMERA), BAG_WIRE), 1)
         wall = np.full((CAMERA.height, CAMERA.width), 3500, np.uint16)
         bag.write(depth_topic("kinect1"), DepthImage().encode((2, "camera", wall), BAG_WIRE), 2)
     assert cli.main(["mesh", "personalise", str(folder), "-o", str(out)]) != 0

@@ -15,8 +15,9 @@ from body_tracking.core.camera import Camera
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.sources import SensorNameError
-from body_tracking.mesh.codecs import DepthImage, DepthInfo, MeshMarker
+from body_tracking.mesh.codecs import DepthImage, MeshMarker
 from body_tracking.mesh.topics import depth_topic, info_topic, mesh_topic
+from body_tracking.messages.codecs import CameraInfo
 from body_tracking.recording.rosbag2 import BAG_WIRE
 from body_tracking.viewing.mesh_view import MeshView
 from body_tracking.viewing.page import Page
@@ -89,7 +90,7 @@ def outline(view: MeshView) -> np.ndarray:
     return np.argwhere(shown(view).min(axis=2) >= OUTLINE) * 128.0 / shown(view).shape[1]
 
 
-INFOS = [DepthInfo().encode((0, CAMERA), BAG_WIRE)]
+INFOS = [CameraInfo().encode((0, CAMERA), BAG_WIRE)]
 
 
 def test_the_mesh_is_outlined_on_the_image_that_it_was_fitted_to(view: MeshView, clock: Clock) -> None:
@@ -150,7 +151,7 @@ def test_what_is_off_is_not_taken_and_what_is_malformed_is_not_drawn(view: MeshV
     clock.now += 1.0
     # a calibration of another size
     other = Camera("camera", 64, 53, CAMERA.matrix, np.zeros(5))
-    draw(view, {MESH: [square(1)], IMAGES: [image(1, 2.0)], INFO: [DepthInfo().encode((0, other), BAG_WIRE)]})
+    draw(view, {MESH: [square(1)], IMAGES: [image(1, 2.0)], INFO: [CameraInfo().encode((0, other), BAG_WIRE)]})
     assert not len(outline(view))
     with pytest.raises(SensorNameError):
         MeshView(("a/b",))
