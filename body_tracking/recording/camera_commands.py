@@ -64,6 +64,8 @@ def _model(args: argparse.Namespace) -> int:
 
 
 def _show(args: argparse.Namespace) -> int:
+    if not args.image.is_file():  # OpenCV would print a line of its own
+        raise CameraCommandError(f"{args.image}: no such file")
     model = PoseModel(args.pose_model or model_files.default_folder())
     pixels: Any = cv2.imread(str(args.image), cv2.IMREAD_COLOR)
     if pixels is None:

@@ -55,7 +55,7 @@ _FIELD: Final = float(np.radians(45.0))
 """Vertical angle of view."""
 _ARMS: Final = 1.1
 """Metres from the middle of a person with raised arms that are in view, also in a narrow scene ..."""
-_ROOM_S: Final = 10.0
+_ROOM_S: Final = 30.0
 """Seconds in which a browser makes room for the panels."""
 _FARTHEST: Final = 4.0
 """... but from no farther away than so many times :data:`_CAMERA_OFFSET`."""
@@ -264,8 +264,6 @@ class Page:
 
     def _look_at_person(self, client: viser.ClientHandle) -> None:
         """Show the whole person to a new browser, again when it has made room for the panels of this page."""
-        # now it has none, or the wider ones of the start page
-        self._look(client, client.camera.image_width - 2 * WIDTH)
         width, end = client.camera.image_width, time.monotonic() + _ROOM_S
 
         def resized(camera: viser.CameraHandle) -> None:
@@ -275,6 +273,9 @@ class Page:
                 self._look(client, width)
 
         client.camera.on_update(resized)
+        # now it has none, or the wider ones of the start page
+        self._look(client, width - 2 * WIDTH)
+        resized(client.camera)  # it may have changed meanwhile
 
     def _look(self, client: viser.ClientHandle, width: int) -> None:
         """Look at the person, in a scene of so many pixels in width."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -57,3 +57,15 @@ def test_a_camera_that_the_user_moves_stays() -> None:
     browser.camera.position = np.full(3, 7.0)
     browser.resize(700)  # an update without another width
     assert np.array_equal(browser.camera.position, np.full(3, 7.0))
+
+
+def test_a_scene_that_is_resized_while_the_camera_is_placed_is_seen_from_as_near() -> None:
+    scene, browser = 1280 - 2 * WIDTH, Browser(360)
+
+    @contextlib.contextmanager
+    def atomic() -> Iterator[None]:
+        browser.camera.image_width = scene  # before anybody is told
+        yield
+
+    browser.atomic = atomic  # type: ignore[assignment]
+    assert seen_by(browser) == pytest.approx(seen_by(Browser(1280), scene))
