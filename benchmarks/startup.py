@@ -51,6 +51,8 @@ class Listener:
 
     def wait(self, begin: float) -> float:
         """Seconds from ``begin`` to the first angles."""
+        for _ in range(20):  # angles of the graph before may still wait
+            self._executor.spin_once(0.0)
         self.first = None
         while self.first is None and time.monotonic() < begin + PATIENCE:
             self._executor.spin_once(0.05)
