@@ -2,7 +2,7 @@
 
 Each bone of the rig is rotated as its segment of :class:`~body_tracking.kinematics.upper_body.UpperBody`. Bends of
 spine and neck are distributed over their bones, as are the twists of upper arm and forearm, like skin. The true joints
-are the rig's own; their positions differ from those of the tracker's body model.
+are the rig's own; those of arms and legs are defined as in the tracker's body model, by the same helper cubes.
 """
 
 from __future__ import annotations

