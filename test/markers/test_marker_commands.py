@@ -159,5 +159,6 @@ def test_unusable_recordings_are_refused_in_one_line(
 
 def test_images_without_a_rig_are_refused_with_its_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shipped = Path(__file__).resolve().parents[2] / "bags" / "markers_arm"
+    save_targets([Target("hand", TARGET_POINTS, np.zeros((15, 15)))], tmp_path / setup.TARGETS)
     assert cli.main(["markers", "angles", str(shipped), "--setup", str(tmp_path), "-o", str(tmp_path / "out")]) == 2
     assert f"Images need {tmp_path / setup.RIG}, which is not there" in capsys.readouterr().err
