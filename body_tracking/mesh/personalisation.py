@@ -16,7 +16,7 @@ import numpy as np
 
 from body_tracking.core import so3
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.core.skeleton import FloatArray
+from body_tracking.core.skeleton import FloatArray, IntArray
 from body_tracking.mesh.body_model import Body, BodyModel, Pose
 from body_tracking.mesh.energy import Observation
 from body_tracking.mesh.skinning import lever_arms
@@ -25,8 +25,8 @@ from body_tracking.mesh.uncertainty import joint_shape_gradients, point_shape_gr
 
 SCALES: Final = (0.1, 0.1, 0.06, 0.06, 0.03, 0.03, 0.03, 0.03)
 """Metres: robust scale of each joint step."""
-STATURES: Final = (-1.2, 0.0, 1.2)
-"""Initial values of the first shape component, the stature."""
+STATURES: Final = (0.0, -1.2, 1.2)
+"""Initial values of the first shape component, the stature; poses that are given were fitted with the mean one."""
 
 
 class PersonalisationError(BodyTrackingError):
@@ -166,32 +166,43 @@ class _FrameSystem:
 
 
 def _system(fitter: MeshFitter, observation: Observation, pose: Pose, scale: float) -> _FrameSystem:
-    body, model = fitter.body, fitter.body.model
     evaluation = fitter.evaluate(observation, pose, scale)
-    fit = evaluation.fit
-    posed = fit.posed
-    corners, shares = fit.matches.corners, fit.matches.shares
-    arms = lever_arms(
-        *(corners, shares, posed.rest, model.bones, model.weights, model.parents, body.joints),
-        *(posed.turned, posed.placed),
-    )
-    rows = pose_rows(arms, fit.matches.normals, fit.frames)
-    moved = point_shape_gradients(
-        *(corners, shares, model.vertex_shapes, model.joint_shapes, model.bones, model.weights),
-        *(posed.turned, joint_shape_gradients(model, posed)),
-    )
-    by_shape = np.einsum("na,nas->ns", fit.matches.normals, moved)
-    residuals = ((fit.matches.places - observation.points) * fit.matches.normals).sum(axis=1)
-    mixed = (rows.T * fit.weights) @ by_shape
+    fit, pulls, matches = evaluation.fit, evaluation.pulls, evaluation.fit.matches
+    planes = ((matches.places - observation.points) * matches.normals).sum(axis=1)
+    own = pulls.vertices[:, None]
+    terms = [
+        _rows(fitter, fit, matches.corners, matches.shares, matches.normals),
+        _rows(fitter, fit, own, np.ones((len(own), 1)), pulls.directions),
+    ]
+    by_pose, by_shape = (np.concatenate(each) for each in zip(*terms, strict=True))
+    weights = np.concatenate([fit.weights, evaluation.pull_weights])
+    residuals = np.concatenate([planes, pulls.residuals])
+    mixed = (by_pose.T * weights) @ by_shape
     information = fit.information.copy()
     diagonal = np.arange(len(information))
     information[diagonal, diagonal] = 1.01 * information[diagonal, diagonal] + 1e-6
     solved = np.linalg.solve(information, np.column_stack([mixed, evaluation.gradient]))
     return _FrameSystem(
         fit,
-        (by_shape.T * fit.weights) @ by_shape,
-        by_shape.T @ (fit.weights * residuals),
+        (by_shape.T * weights) @ by_shape,
+        by_shape.T @ (weights * residuals),
         mixed,
         solved[:, :-1],
         solved[:, -1],
     )
+
+
+def _rows(
+    fitter: MeshFitter, fit: Fit, corners: IntArray, shares: FloatArray, directions: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Derivatives of points on the body along directions (n, 3), by the pose and by the shape."""
+    body, model, posed = fitter.body, fitter.body.model, fit.posed
+    arms = lever_arms(
+        *(corners, shares, posed.rest, model.bones, model.weights, model.parents, body.joints),
+        *(posed.turned, posed.placed),
+    )
+    moved = point_shape_gradients(
+        *(corners, shares, model.vertex_shapes, model.joint_shapes, model.bones, model.weights),
+        *(posed.turned, joint_shape_gradients(model, posed)),
+    )
+    return pose_rows(arms, directions, fit.frames), np.einsum("na,nas->ns", directions, moved)

@@ -20,7 +20,7 @@ from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
 from body_tracking.mesh import energy
 from body_tracking.mesh.anatomy import SIDES, Anatomy
 from body_tracking.mesh.body_model import Body, Pose, PosedBody
-from body_tracking.mesh.energy import Matches, Observation
+from body_tracking.mesh.energy import Matches, Observation, Pulls
 from body_tracking.mesh.skinning import lever_arms, vertex_normals
 
 SCALES: Final = (0.05, 0.05)
@@ -406,15 +406,16 @@ class MeshFitter:
             energy.MARGIN,
         )
         facing = max(int(((normals * posed.vertices).sum(axis=1) < 0.0).sum()), 1)
+        robust, cost = _robust(pulls.residuals, 2.0 * scale)
+        each = settings.patches / facing / np.where(pulls.kinds == 0, settings.silhouette, settings.front) ** 2
+        pull_weights = each * robust
         if len(pulls.vertices):
-            robust, cost = _robust(pulls.residuals, 2.0 * scale)
-            each = settings.patches / facing / np.where(pulls.kinds == 0, settings.silhouette, settings.front) ** 2
             own = pulls.vertices[:, None]
             arms = lever_arms(
                 *(own, np.ones((len(own), 1)), posed.rest, model.bones, model.weights, model.parents),
                 *(body.joints, posed.turned, posed.placed),
             )
-            system.add(arms, pulls.directions, pulls.residuals, each * robust)
+            system.add(arms, pulls.directions, pulls.residuals, pull_weights)
             total += float((each * cost).sum())
         total += self._add_angles(system, pose, None if prediction is None else prediction.hidden)
         if prediction is not None:
@@ -433,7 +434,7 @@ class MeshFitter:
             rms=float(np.sqrt((planes[near] ** 2).mean())) if near.any() else float("inf"),
             lost=1.0 - matched + violations > settings.unexplained,
         )
-        return Evaluation(fit, system.gradient)
+        return Evaluation(fit, system.gradient, pulls, pull_weights)
 
     def _add_angles(self, system: _System, pose: Pose, hidden: BoolArray | None) -> float:
         """Limits (Jatesiktat 2018, eq. 8) and ordinary postures, weighted less for ``hidden`` joints (J,)."""
@@ -518,10 +519,14 @@ class Evaluation:
     Attributes:
         fit: of the pose.
         gradient: (3 + 3 J,) of the energy by the pose's change.
+        pulls: vertices outside the silhouette or in front of the measured surface.
+        pull_weights: (m,) of ``pulls`` in the information, 1/m^2.
     """
 
     fit: Fit
     gradient: FloatArray
+    pulls: Pulls
+    pull_weights: FloatArray
 
     def step(self, damping: float) -> FloatArray:
         """Levenberg-Marquardt step (Jatesiktat 2018, eq. 15-16; section II-F), scaled by the diagonal (Marquardt 1963).

@@ -46,7 +46,10 @@ def load(path: Path, model: BodyModel) -> tuple[Body, FloatArray]:
         data = files.read_yaml(path)
         shape, covariance = (np.asarray(data[name], dtype=np.float64) for name in ("shape", "covariance"))
         if covariance.shape != (count, count) or not np.isfinite(covariance).all():
-            raise ValueError(f"covariance of {covariance.shape}, expected ({count}, {count}) finite numbers")
+            raise ValueError(
+                f"covariance of {covariance.shape}, expected ({count}, {count}) finite numbers; a shape of another "
+                "body model has to be estimated anew"
+            )
         if np.linalg.eigvalsh(covariance).min() < -1e-6 or not np.allclose(covariance, covariance.T, atol=1e-6):
             raise ValueError("covariance: not symmetric and positive semidefinite")
         return model.body(shape), covariance

@@ -48,6 +48,8 @@ _FASTEST: Final = 3.0
 _SMALLER: Final = (-1.6, -3.2)
 """First shape component (size) of smaller bodies, standard deviations: 1.54 and 1.38 m. The mean body of 1.70 m fits
 people of 1.60 to 2 m."""
+_FARTHER_OUT: Final = 0.03
+"""Growth of the share of vertices outside of the silhouette above which hanging arms are no better fit."""
 _WHOLE: Final = 0.99
 """Share of explained points below which a start with hanging arms is tried."""
 _EXPLAINED: Final = 0.97
@@ -298,11 +300,14 @@ class MeshTracker:
         starts = [] if fit.matched >= _EXPLAINED else self._fitter.towards_unmatched(seen, fit)
         if starts:
             self.counters["starts with a hand elsewhere"] += 1
+        fits = [self._fitter.fit(seen, start, None, orientations) for start in starts]
         if fit.matched < _WHOLE and not self._waits(stamp_ns, self._arms_ns):
             self._arms_ns = stamp_ns
             self.counters["starts with hanging arms"] += 1
-            starts = [*starts, self._fitter.with_hanging_arms(fit.pose)]
-        fits = [self._fitter.fit(seen, start, None, orientations) for start in starts]
+            hanging = self._fitter.fit(seen, self._fitter.with_hanging_arms(fit.pose), None, orientations)
+            # an arm that points at the camera is few points, and costs less energy where it hangs and explains none
+            outside = hanging.violations - fit.violations
+            fits += [hanging] if hanging.matched >= fit.matched and outside < _FARTHER_OUT else []
         if fit.violations > _OUTSIDE and not self._waits(stamp_ns, self._wide_ns):
             self._wide_ns = stamp_ns
             self.counters["starts with a wide scale"] += 1

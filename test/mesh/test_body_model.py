@@ -210,7 +210,7 @@ def test_smpl_files_load_from_npz_and_pickle_alike(
         np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
     pose = random_pose(ours, np.random.default_rng(1))
     # eq. 3 of Loper et al., with dense weights
-    body = ours.body(np.ones(10))
+    body = ours.body(np.ones(12))
     posed = body.posed(pose)
     dense = np.zeros((len(ours.vertices), joints))
     np.put_along_axis(dense, ours.bones, ours.weights, axis=1)
@@ -234,7 +234,7 @@ def test_chumpy_arrays_of_the_official_files_load_without_chumpy(arrays: dict[st
     ours = f"c{__name__}\nChumpyArray\n".encode()
     assert ours in raw
     (tmp_path / "model.pkl").write_bytes(raw.replace(ours, b"cchumpy.ch\nCh\n"))
-    assert body_model.load(tmp_path / "model.pkl").vertex_shapes.shape[2] == 10
+    assert body_model.load(tmp_path / "model.pkl").vertex_shapes.shape[2] == 12
 
 
 class Bomb:

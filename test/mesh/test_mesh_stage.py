@@ -130,7 +130,7 @@ def test_of_two_people_the_tracked_one_is_kept() -> None:
 def test_the_shape_is_estimated_from_different_poses_and_kept_in_a_file(tmp_path: Path) -> None:
     file = tmp_path / "person.yaml"
     node = calibrated(person=str(file), personalise_from=2)
-    for number in (0, 1, 106):  # the arms hang, and are stretched forward
+    for number in (30, 31, 106):  # a T-pose, and arms stretched forward
         node.sensor.reset()
         assert not node.counters.get("personalisations")
         take(node, number)
@@ -149,7 +149,7 @@ def test_somebody_else_does_not_get_the_shape_of_who_has_left() -> None:
     node = calibrated()
     sensor = node.sensor
     take(node, 0)
-    sensor._wear(body_model.load().body(np.full(10, 0.5)), 0.1 * np.eye(10))
+    sensor._wear(body_model.load().body(np.full(12, 0.5)), 0.1 * np.eye(12))
     for number in range(1, 20):
         take(node, number, np.zeros_like(recording().images[STAMPS[0]]))
     assert node.counters["people lost"] == 1 and not sensor.body.shape.any()
@@ -235,17 +235,18 @@ def test_orientations_wait_for_the_pose_of_the_camera_and_then_turn_a_hidden_for
     node = calibrated(orientations=("forearm_left",))
     topic = graph.orientation_topic("forearm_left")
     assert {topic, graph.CALIBRATION, graph.CALIBRATION_CLOCK} < {port.topic for port in node.inputs}
-    (first,) = take(node, 0)
+    start = 118
+    (first,) = take(node, start)
     assert node.counters["images without the camera's pose for inertial sensors"] == 1
     [*node.take(graph.CALIBRATION, replace(CAMERA_POSE, sensor="kinect2"), NOW)]
     [*node.take(graph.CALIBRATION_CLOCK, SensorClock("kinect1_mesh", 0, ClockModel()), NOW)]
     [*node.take(graph.CALIBRATION, CAMERA_POSE, NOW)]
     # the arm hangs in the images; the sensor says that the forearm is raised forward by 40 degrees
-    joints = recording().joints[STAMPS[0]]
+    joints = recording().joints[STAMPS[start]]
     pixel = recording().camera.project(joints[[Joint.ELBOW_LEFT, Joint.WRIST_LEFT, Joint.HAND_TIP_LEFT]]).astype(int)
     (left, top), (right, bottom) = pixel.min(axis=0) - 8, pixel.max(axis=0) + 8
     measured = so3.matrix_to_quat(CAMERA_POSE.rotation @ FOREARM)
-    for number in range(1, 10):
+    for number in range(start + 1, start + 10):
         hidden = recording().images[STAMPS[number]].copy()
         hidden[top:bottom, left:right] = 1.2
         [*node.take(topic, turned(STAMPS[number] + 5_000_000, measured), NOW)]
@@ -258,7 +259,7 @@ def test_orientations_wait_for_the_pose_of_the_camera_and_then_turn_a_hidden_for
     assert off[0] > np.radians(25.0) and off[1] < np.radians(8.0)
     # a jump back of its time forgets the sensor
     node.reset(topic)
-    take(node, 10)
+    take(node, start + 10)
     assert node.counters["images without an orientation of forearm_left"] == 1
     node.refused(topic)
     assert node.counters["inertial messages that cannot be used"] == 1

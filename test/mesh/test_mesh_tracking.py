@@ -67,12 +67,13 @@ def test_arms_of_an_unknown_person_are_nearer_to_the_truth_than_a_kinects_and_wi
     assert np.linalg.norm(errors, axis=2).mean() < min(0.032, np.linalg.norm(kinect, axis=2).mean())  # 28 and 39 mm
     covariances = np.array([each.covariance[ARMS] for each in found if each])
     nees = np.einsum("tna,tnab,tnb->tn", errors, np.linalg.inv(covariances), errors) / 3.0
-    # one person, whose shape errs the same way in all images: wider than the 0.5 to 2 over many
-    assert 0.3 < nees.mean() < 2.5
-    skeleton = found[-1].skeleton("camera") if found[-1] else None
-    assert skeleton is not None and skeleton.covariances is not None
-    # the legs' surface is seen as well
-    assert np.mean(skeleton.states == TrackingState.TRACKED) > 0.7
+    # one person, whose shape errs the same way in all images and is near the mean: wider than the 0.5 to 2 over many
+    assert 0.1 < nees.mean() < 2.5
+    skeletons = [each.skeleton("camera") for each in found if each]
+    assert all(each.covariances is not None for each in skeletons)
+    # the legs' surface is seen as well; hands and feet of unknown people are not known well
+    ends = [joint for joint in Joint if not joint.name.startswith(("HAND", "THUMB", "FOOT"))]
+    assert np.mean([each.states[ends] == TrackingState.TRACKED for each in skeletons]) > 0.9
 
 
 def test_an_arm_that_comes_to_point_at_the_camera_is_followed(tracker: MeshTracker) -> None:
