@@ -1,9 +1,9 @@
 """A skinned body model in SMPL's form, one person's body in that model, and a pose.
 
 Loper et al., "SMPL: a skinned multi-person linear model", SIGGRAPH Asia 2015. The shipped model was made from
-MakeHuman's data by ``scripts/make_body_model.py``; files of SMPL, SMPL-H and SMPL-X load too. Every model gets two shape
-components more, the thickness of the clothes above and below the waist, which move the skin outwards and no joint. Model
-axes: x left, y up, z forward, metres.
+MakeHuman's data by ``scripts/make_body_model.py``; files of SMPL, SMPL-H and SMPL-X load too. Every model gets two more
+shape components, the thickness of the clothes above and below the waist, which move the skin outwards and no joint.
+Model axes: x left, y up, z forward, metres.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ JOINTS: Final = tuple(name for name in SMPL_JOINTS if name not in ("left_foot", 
 """The 20 joints of the project's own model."""
 _COUNTS: Final = {24: "SMPL", 52: "SMPL-H", 55: "SMPL-X"}
 CLOTHES: Final = (0.008, 0.006)
-"""Mean and standard deviation of the clothes' thickness over people, metres. Ordinary clothes stand off by 5 to 15 mm."""
+"""Mean and standard deviation of the clothes' thickness over people, metres: clothes stand off by 5 to 15 mm."""
 _BARE: Final = ("head", "neck", "left_wrist", "right_wrist")
 """Joints whose segments wear no clothes."""
 _BONES: Final = 8

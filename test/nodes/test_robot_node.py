@@ -450,10 +450,16 @@ def test_the_diagnostics_of_many_nodes_are_not_taken_for_lost_messages(tmp_path:
         running.start("robot_commands", mapping=mapping_file("two_joint_arm"))
         nodes = [running.node.create_publisher(DiagnosticArray, graph.DIAGNOSTICS_TOPIC, 10) for _ in range(8)]
         assert running.until(lambda: all(each.get_subscription_count() > 1 for each in nodes))
-        for _ in range(20):
+
+        ticks = itertools.count()
+
+        def received() -> bool:
+            # as often as it takes: a busy machine loses some
+            tick = next(ticks)
             for number, each in enumerate(nodes):
-                for _ in range(1 + number):
+                if tick % (1 + number) == 0:
                     each.publish(DiagnosticArray())
-            running.until(lambda: False, timeout=0.02)
-        assert running.until(lambda: running.number("robot_commands", "received") > 300)
+            return running.until(lambda: running.number("robot_commands", "received") > 100, timeout=0.02)
+
+        assert running.until(received)
         assert f"lost {graph.DIAGNOSTICS_TOPIC}" not in running.said("robot_commands")
