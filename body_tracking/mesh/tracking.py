@@ -46,7 +46,7 @@ _SLOWEST: Final = 0.35
 _FASTEST: Final = 3.0
 """m/s: horizontal speed of a walking person; a faster one indicates a change of person."""
 _SMALLER: Final = (-1.6, -3.2)
-"""First shape component (size) of smaller bodies, standard deviations: 1.54 and 1.38 m. The mean body of 1.70 m fits
+"""First shape component (size) of smaller bodies, standard deviations: 1.55 and 1.42 m. The mean body of 1.69 m fits
 people of 1.60 to 2 m."""
 _FARTHER_OUT: Final = 0.03
 """Growth of the share of vertices outside of the silhouette above which hanging arms are no better fit."""
