@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pty
+import select
 import sys
 import time
 from collections import deque
@@ -111,7 +112,10 @@ def test_a_narrow_terminal_shows_the_whole_status_over_several_lines(monkeypatch
         console.line("a line above")
         console.end()
         console.line("the end")
-        text = os.read(master, 10_000).decode()
+        text = ""
+        # a terminal passes on what was written in pieces
+        while "the end\r\n" not in text and select.select([master], [], [], 10.0)[0]:
+            text += os.read(master, 10_000).decode()
     os.close(master)
     drawn, above, again = (
         text.partition("\r\x1b[2A\x1b[J")[0],
