@@ -8,7 +8,8 @@ of the treadmill: its largest piece is used, after an opening by 5 pixels.
 The views of ``depth_turn`` are tracked as a sequence of 10 images per second: with the mean person's body, then with
 the person's body from six of the views; figures are of the other 28. ``torso`` is the angle between the rotations of
 the thorax and of the camera between two views, degrees, median over all pairs of views; it includes the person's own
-bending and twisting. In the last row the person is found without the masks.
+bending and twisting, and varies with the six views: its bar is of the median over ten choices of them. In the last row
+the person is found without the masks.
 """
 
 from __future__ import annotations
@@ -39,11 +40,11 @@ from body_tracking.mesh.tracking import MeshTracker, observe_person
 from body_tracking.simulation.depth_scene import kinect_camera
 
 SETS = ((0, 6, 11, 17, 23, 28), (3, 9, 14, 20, 26, 31))
-_RNG = np.random.default_rng(5)
-DRAWN = [tuple(sorted(_RNG.choice(34, 6, replace=False).tolist())) for _ in range(8)]
-"""Six views each: of the shape of the figures and of the second shoulder width; further ones for the torso."""
 """Two disjoint sets of views for the person's shape, each about 60 degrees apart."""
 _VIEWS = 34
+_RNG = np.random.default_rng(5)
+DRAWN = [tuple(sorted(_RNG.choice(_VIEWS, 6, replace=False).tolist())) for _ in range(8)]
+"""Further choices of six views for the turn of the torso, which one choice alone gives to half a degree."""
 _RATE = 10.0
 """Images per second: the benchmark uses every third image of a sequence at about 30."""
 

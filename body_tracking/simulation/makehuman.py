@@ -35,13 +35,13 @@ _AXES: Final = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _LEVELS: Final = ("min", "average", "max")
 _STATURES: Final = {"male": (1.76, 0.07), "female": (1.63, 0.065)}
 """Mean and standard deviation, metres: adults of high-income countries (NCD-RisC 2016; Visscher 2008)."""
-_ARMS: Final = {
+ARMS: Final = {
     "upperarm": ("shoulder", "elbow", {"male": 0.1618, "female": 0.1586}),
     "lowerarm": ("elbow", "hand", {"male": 0.1545, "female": 0.1523}),
 }
 """Joints of the arms' bones, and mean lengths as shares of the stature (de Leva, J. Biomech. 29 (1996) 1223, table 4).
 MakeHuman's own upper arms are a tenth shorter."""
-_PROPORTION_STDDEV: Final = 0.04
+PROPORTION_STDDEV: Final = 0.04
 _ASYMMETRY_STDDEV: Final = 0.008
 """Relative standard deviations of a bone's length, as in :mod:`body_tracking.simulation.people`."""
 _BREADTHS: Final = ("torso/torso-scale-horiz", "torso/torso-vshape", "hip/hip-scale-horiz")
@@ -214,8 +214,8 @@ class MakeHuman:
     def _with_arms(self, vertices: FloatArray, sex: str, rng: np.random.Generator) -> FloatArray:
         """The person with arms of drawn lengths."""
         stature = np.ptp(vertices[: self._skin, 2])
-        for part, (start, end, shares) in _ARMS.items():
-            both = 1.0 + _PROPORTION_STDDEV * rng.normal()
+        for part, (start, end, shares) in ARMS.items():
+            both = 1.0 + PROPORTION_STDDEV * rng.normal()
             for side in ("l", "r"):
                 cubes = f"joint-{side}-{start}", f"joint-{side}-{end}"
                 length = self._distance(*cubes, vertices)

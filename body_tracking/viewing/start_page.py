@@ -10,6 +10,7 @@ from typing import Any, Final, Self
 
 import viser
 
+from body_tracking.pipeline.roles import DEFAULT_FILTER
 from body_tracking.viewing.server import address_of, serve, stop
 from body_tracking.viewing.state import GREEN, GREY, ORANGE, RED, block, line
 
@@ -101,7 +102,7 @@ class StartPage:
                 "filter",
                 (DEFAULT, *filters),
                 initial_value=before.filter,
-                hint="default: lkf_constant_velocity, or ekf where all sensors are colour cameras or inertial ones",
+                hint=f"default: {DEFAULT_FILTER}, or ekf where all sensors are colour cameras or inertial ones",
             )
             self._convention: Any = gui.add_dropdown(
                 "angles",

@@ -220,6 +220,34 @@ def test_smpl_files_load_from_npz_and_pickle_alike(
     np.testing.assert_allclose(posed.vertices, expected, atol=1e-12)
 
 
+@pytest.mark.parametrize("joints", [20, 24, 52, 55])
+def test_clothes_move_the_skin_outwards_but_no_joint_nor_bare_skin(
+    joints: int, arrays: dict[str, Any], tmp_path: Path
+) -> None:
+    path = body_model.SHIPPED[1000]
+    if joints > 20:
+        path, content = tmp_path / "model.npz", smpl(arrays, joints)
+        # the hand's surface moves with a joint behind the wrist
+        wrist = body_model.SMPL_JOINTS.index("left_wrist")
+        content["weights"][:, [wrist, 22]] = content["weights"][:, [22, wrist]]
+        np.savez(path, **content)
+    model = body_model.load(path)
+    strongest = model.bones[np.arange(len(model.vertices)), model.weights.argmax(axis=1)]
+    worn = {}
+    for name, component in (("above", -2), ("below", -1)):
+        assert not model.joint_shapes[..., component].any()
+        moved = np.linalg.norm(model.vertex_shapes[..., component], axis=1)
+        worn[name] = {model.joint_names[joint] for joint in np.unique(strongest[moved > 0.0])}
+        np.testing.assert_allclose(moved[moved > 0.0], body_model.CLOTHES[1])
+        outwards = (model.vertex_shapes[..., component] * vertex_normals(model.vertices, model.faces)).sum(axis=1)
+        assert np.median(outwards[moved > 0.0]) > 0.9 * body_model.CLOTHES[1]
+    assert {"left_shoulder", "left_elbow", "spine2"} <= worn["above"]
+    assert {"pelvis", "left_hip", "right_knee"} <= worn["below"] and not worn["above"] & worn["below"]
+    # "joint22" and so on are those of fingers and of the face
+    dressed = worn["above"] | worn["below"]
+    assert not {"head", "neck", "left_wrist", "right_wrist", "joint22"} & dressed
+
+
 class ChumpyArray:
     """Pickled like chumpy's arrays: the class's name and a dictionary with the numbers under ``x``."""
 

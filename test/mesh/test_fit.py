@@ -435,8 +435,8 @@ def test_shapes_of_people_from_three_poses(camera: DepthCamera) -> None:
         distances.append(off_by @ np.linalg.solve(found.covariance, off_by) / len(off_by))
         assert not any(fit.lost for fit in found.fits)
     rms = np.sqrt(np.mean(np.square(errors), axis=0))
-    # the arms of the six vary by 15 mm, the thighs by 27 mm
-    assert rms[:2].max() < 0.015 and rms[2] < 0.02
+    # upper arms of the six vary by 17 mm, forearms by 22 and thighs by 21
+    assert rms.max() < 0.015
     assert max(distances) < 3.0
 
 
