@@ -42,7 +42,7 @@ MARKERS = ("--sensors", "none", "--bag", "bags/markers_arm", "--marker-setup", "
 PAGES = {
     "viewer": (WAVE, 11.0),
     "viewer_camera": (CAMERA, 7.0),
-    "viewer_mesh": (MESH, 6.5),
+    "viewer_mesh": (MESH, 6.1),
     "viewer_markers": (MARKERS, 4.0),
 }
 """Arguments of ``up``, and the seconds of the recording after which the picture is taken."""
