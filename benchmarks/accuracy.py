@@ -31,7 +31,7 @@ from typing import Any
 import common
 import numpy as np
 from common import Mean
-from offline_graph import OfflineGraph
+from offline_graph import play
 from thesis_pipeline import EKF, LKF1, LKF2, run_thesis
 
 from body_tracking.core.sensor_poses import SensorPose
@@ -118,7 +118,7 @@ def filtered_by(settings: ReplaySettings, frames: Sequence[RecordedFrame]) -> tu
         if topic in found:
             found[topic] += decode_skeletons(cdr) or ()
 
-    OfflineGraph(settings, take, map(graph.skeleton_topic, settings.sensors)).play(frames)
+    play(settings, frames, take)
     return found[graph.FUSED], found[graph.FILTERED]
 
 
@@ -297,16 +297,6 @@ def sensitivity_part(seeds: int, workers: int, motions: Sequence[str]) -> Table:
 DOCS = common.ROOT / "docs"
 
 
-def page(text: str, parts: Mapping[str, Table]) -> str:
-    """docs/accuracy.md with new sections of these parts; the rest stays."""
-    for part, table in parts.items():
-        begin, end = f"<!-- {part}: written by benchmarks/accuracy.py -->\n", f"<!-- end of {part} -->\n"
-        before, found, rest = text.partition(begin)
-        assert found and end in rest, f"docs/accuracy.md has no section {part}"
-        text = f"{before}{begin}\n{chr(10).join(_section(part, table))}\n{end}{rest.partition(end)[2]}"
-    return text
-
-
 def _section(part: str, table: Table) -> list[str]:
     people = _people(table)
     if part == "layouts":
@@ -317,7 +307,6 @@ def _section(part: str, table: Table) -> list[str]:
             f"the best layout of each motion; {people} people each.",
             "",
             "![error by motion and layout](accuracy_layouts.svg)",
-            "",
         ]
     if part == "sensitivity":
         return [
@@ -327,7 +316,6 @@ def _section(part: str, table: Table) -> list[str]:
             "simulator halved and doubled. The change is smaller where a parameter reaches a bound of its range.",
             "",
             *_markdown(table, "fixed"),
-            "",
         ]
     lines = [
         f"## Every motion in layout 4, {people} people each",
@@ -345,7 +333,6 @@ def _section(part: str, table: Table) -> list[str]:
         "### Ratios of errors without constant offsets: this package to the thesis",
         "",
         *_ratios(table),
-        "",
     ]
 
 
@@ -469,8 +456,8 @@ def main() -> int:
             parser.error(f"no such part: {part}")
     common.report(args, parts)
     if args.write:
-        file = DOCS / "accuracy.md"
-        file.write_text(page(file.read_text(), parts))
+        for part, table in parts.items():
+            common.write_section(DOCS / "accuracy.md", part, "accuracy.py", _section(part, table))
         if "layouts" in parts:
             draw_layouts(parts["layouts"], DOCS / "accuracy_layouts.svg")
     return 0

@@ -101,57 +101,30 @@ def frequency(times: FloatArray, values: FloatArray) -> float:
     return fit_swing(times, values, "sine").frequency
 
 
-Way = Callable[[PendulumScene, np.random.Generator], float]
-
-
-def _even(scene: PendulumScene, rng: np.random.Generator) -> float:
-    times = np.arange(round(30.0 * SECONDS)) / 30.0
-    return frequency(times, seen(scene, times, rng))
-
-
-def _lost(scene: PendulumScene, rng: np.random.Generator) -> float:
-    times = capture_times(SECONDS, rng)
-    return frequency(times, seen(scene, times, rng))
-
-
-def _images(scene: PendulumScene, rng: np.random.Generator) -> float:
-    times = capture_times(SECONDS, rng)
-    return frequency(times, rendered(scene, times))
-
-
-def _stamps(scene: PendulumScene, rng: np.random.Generator) -> float:
-    times = capture_times(SECONDS, rng)
-    return frequency(times + rng.normal(0.0, JITTER, len(times)), seen(scene, times, rng))
-
-
-def _small(scene: PendulumScene, rng: np.random.Generator) -> float:
-    times = capture_times(SECONDS, rng)
-    return frequency(times, 1e-3 * seen(scene, times, rng))
-
-
-def _steps(scene: PendulumScene, rng: np.random.Generator) -> float:
-    times = capture_times(SECONDS, rng)
-    return frequency(np.arange(len(times)) / 30.0, seen(scene, times, rng))
-
-
-def _peak(scene: PendulumScene, rng: np.random.Generator) -> float:
-    times = capture_times(SECONDS, rng)
-    return peak(times, seen(scene, times, rng))
-
-
-JUDGED: dict[str, Way] = {"even frames": _even, "lost, irregular": _lost, "stamps": _stamps, "images": _images}
-COMPARED: dict[str, Way] = {"without amplitude": _small, "even steps": _steps, "peak": _peak}
+WAYS: dict[str, Callable[[PendulumScene, FloatArray, np.random.Generator], float]] = {
+    "even frames": lambda scene, times, rng: frequency(times, seen(scene, times, rng)),
+    "lost, irregular": lambda scene, times, rng: frequency(times, seen(scene, times, rng)),
+    "stamps": lambda scene, times, rng: frequency(times + rng.normal(0.0, JITTER, len(times)), seen(scene, times, rng)),
+    "images": lambda scene, times, _: frequency(times, rendered(scene, times)),
+    "without amplitude": lambda scene, times, rng: frequency(times, 1e-3 * seen(scene, times, rng)),
+    "even steps": lambda scene, times, rng: frequency(np.arange(len(times)) / 30.0, seen(scene, times, rng)),
+    "peak": lambda scene, times, rng: peak(times, seen(scene, times, rng)),
+}
+"""The frequency (Hz) by frames at (n,) seconds."""
+JUDGED = ("even frames", "lost, irregular", "stamps", "images")
 
 
 def pendulum(job: tuple[str, int]) -> dict[str, float]:
     """Errors of one method for the frequency, over all lengths, with this number of seeds."""
     name, seeds = job
-    way, errors = (JUDGED | COMPARED)[name], []
+    errors = []
     for length in LENGTHS:
         for seed in range(seeds):
             rng = np.random.default_rng([seed, round(100.0 * length), 72])
             scene = PendulumScene(length, np.radians(rng.uniform(5.0, 20.0)), rng.uniform(0.0, 0.04), seed=seed)
-            errors.append(1e3 * (way(scene, rng) - natural_frequency(length)))
+            even = name == "even frames"
+            times = np.arange(round(30.0 * SECONDS)) / 30.0 if even else capture_times(SECONDS, rng)
+            errors.append(1e3 * (WAYS[name](scene, times, rng) - natural_frequency(length)))
     off = np.abs(errors)
     return {
         "runs": len(off),
@@ -199,7 +172,7 @@ def main() -> int:
     delays = [(seed, delay) for delay in DELAYS for seed in range(args.images)]
     trials = common.mapped(arm, delays, args.jobs)
     arms = {f"{1e3 * delay:.0f} ms, seed {seed}": each for (seed, delay), each in zip(delays, trials, strict=True)}
-    jobs = [(name, args.images if name == "images" else args.seeds) for name in JUDGED | COMPARED]
+    jobs = [(name, args.images if name == "images" else args.seeds) for name in WAYS]
     pendulums = dict(zip([name for name, _ in jobs], common.mapped(pendulum, jobs, args.jobs), strict=True))
     figures: dict[str, Any] = {"arm": arms, "pendulum": pendulums, "floor, mHz": floor(), "vicon": vicon(args.data)}
     common.report(args, figures)

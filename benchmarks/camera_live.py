@@ -14,11 +14,9 @@ from __future__ import annotations
 import itertools
 import multiprocessing
 import sys
-import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import common
@@ -40,7 +38,6 @@ from body_tracking.mesh.topics import IMAGES
 from body_tracking.pipeline import graph
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader
 from body_tracking.simulation.camera_bags import SHIPPED
-from body_tracking.systems import options_of
 
 BEYOND_MS = 15.0
 EXECUTABLE = "camera_skeleton"
@@ -92,8 +89,7 @@ def measured(cameras: int, rate: float, seconds: float, warm_up: float) -> dict[
         bench.publisher(each.depth, Image, IMAGES)
         for info in (each.colour_info, each.depth_info):
             bench.publisher(info, CameraInfo, LATCHED)
-    angles = graph.joint_states_topic(graph.DEFAULT_BODY)
-    bench.time("angles", angles)
+    bench.time("angles", graph.joint_states_topic(graph.DEFAULT_BODY))
     bench.hear_diagnostics()
     poses = {name: SensorPose(name, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])) for name in names}
 
@@ -108,25 +104,14 @@ def measured(cameras: int, rate: float, seconds: float, warm_up: float) -> dict[
                 yield 1.0 + number / rate, topics[name].colour + COMPRESSED, pair["colour"]
                 yield 1.0 + number / rate, topics[name].depth, pair["depth"]
 
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch)
-        calibration = live.calibrated(folder / "calibration.yaml", poses)
-        options = options_of(sensors=(), camera=tuple(names), compressed="colour", calibration=calibration)
-        with live.processes(live.node_commands(folder, options), folder / "log") as running:
-            first = {each.colour + COMPRESSED: 1 for each in topics.values()}
-            live.wait("the nodes", lambda: bench.connected(first), running)
-            live.wait("the last node", lambda: bench.node.count_publishers(angles) > 0, running)
-            time.sleep(1.0)
-            bench.spin()
-            commands = {tuple(each.args): psutil.Process(each.pid) for each in running}
-            nodes = [each for words, each in commands.items() if EXECUTABLE in words]
-            begun, before = sum(live.cpu_seconds(each).sum() for each in nodes), used_pairs(bench, names)
-            counted = {topics[names[0]].colour + COMPRESSED: "angles"}
-            bench.publish(events(), counted, 1.0 + warm_up)
-            time.sleep(2.5)
-            used, after = sum(live.cpu_seconds(each).sum() for each in nodes) - begun, used_pairs(bench, names)
-        values = [dict(bench.values(f"{name}_skeleton")) for name in names]
-    bench.close()
+    first = {each.colour + COMPRESSED: 1 for each in topics.values()}
+    with live.graph_of(bench, first, poses=poses, sensors=(), camera=tuple(names), compressed="colour") as running:
+        nodes = [psutil.Process(each.pid) for each in running if EXECUTABLE in each.args]
+        begun, before = sum(live.cpu_seconds(each).sum() for each in nodes), used_pairs(bench, names)
+        bench.publish(events(), {topics[names[0]].colour + COMPRESSED: "angles"}, 1.0 + warm_up)
+        time.sleep(2.5)
+        used, after = sum(live.cpu_seconds(each).sum() for each in nodes) - begun, used_pairs(bench, names)
+    values = [dict(bench.values(f"{name}_skeleton")) for name in names]
     delays, lost = bench.delays_ms("angles")
     return {
         **live.percentiles(delays, "the graph", 95),

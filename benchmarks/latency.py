@@ -13,10 +13,8 @@ import argparse
 import heapq
 import itertools
 import sys
-import tempfile
 import time
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 import common
@@ -40,7 +38,6 @@ from body_tracking.pipeline import graph
 from body_tracking.recording.rosbag2 import BagReader, deserialize
 from body_tracking.ros.bag_topics import to_profile
 from body_tracking.ros.supervised import die_with_parent
-from body_tracking.systems import options_of
 
 BAG = common.ROOT / "bags" / "tpose_wave"
 SENSORS = ("kinect1", "kinect2")
@@ -143,30 +140,17 @@ def bench_of_graph(name: str) -> live.Bench:
     return bench
 
 
-def node_commands(folder: Path, poses: Mapping[str, SensorPose]) -> list[list[str]]:
-    """Command lines of the graph's nodes."""
-    calibration = live.calibrated(folder / "calibration.yaml", poses)
-    return live.node_commands(folder, options_of(sensors=SENSORS, calibration=calibration))
-
-
 def measure(seconds: float, warm_up: float) -> dict[str, Any]:
     """Run both chains and compare their delays."""
     streams, poses = recorded()
     bench = bench_of_graph("latency_bench")
     bench.publisher(RELAYED[0], PointCloud2)
     bench.time("relay", RELAYED[-1])
-    with tempfile.TemporaryDirectory() as folder:
-        try:
-            with live.processes(node_commands(Path(folder), poses) + relay_commands()) as running:
-                expected = LISTENERS | dict.fromkeys(RELAYED[:-1], 1)
-                live.wait("latency: the processes", lambda: bench.connected(expected), running)
-                time.sleep(0.5)
-                bench.spin()
-                until = itertools.takewhile(lambda event: event[0] < warm_up + seconds, events(streams))
-                bench.publish(until, {graph.skeleton_topic(SENSORS[0]): "graph", RELAYED[0]: "relay"}, warm_up)
-                time.sleep(0.5)
-        finally:
-            bench.close()
+    listeners = LISTENERS | dict.fromkeys(RELAYED[:-1], 1)
+    with live.graph_of(bench, listeners, poses=poses, further=relay_commands(), sensors=SENSORS):
+        until = itertools.takewhile(lambda event: event[0] < warm_up + seconds, events(streams))
+        bench.publish(until, {graph.skeleton_topic(SENSORS[0]): "graph", RELAYED[0]: "relay"}, warm_up)
+        time.sleep(0.5)
     result: dict[str, Any] = {"seconds": seconds, "sensors": len(SENSORS), "processes": len(CHAIN)}
     for chain in ("graph", "relay"):
         delays, lost = bench.delays_ms(chain)

@@ -12,6 +12,7 @@ import signal
 import struct
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -41,7 +42,7 @@ from body_tracking.messages.diagnostics import NodeStatus, statuses
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.system import Options
 from body_tracking.ros.bag_topics import to_profile
-from body_tracking.systems import nodes_for
+from body_tracking.systems import nodes_for, options_of
 
 STAMP = struct.Struct("<iI")
 """Stamp of a message, behind the encapsulation (4 bytes): every message here begins with its header."""
@@ -184,6 +185,7 @@ class Ear:
     Attributes:
         node: of this process.
         received: by name and stamp (ns), the time of receipt (ns) by ``now``.
+        topics: by name.
         statuses: by node, the wall time in s and its last diagnostics.
     """
 
@@ -193,6 +195,7 @@ class Ear:
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.node)
         self.received: dict[str, dict[int, int]] = {}
+        self.topics: dict[str, str] = {}
         self.statuses: dict[str, tuple[float, NodeStatus]] = {}
         self._now = now
         self._thread: threading.Thread | None = None
@@ -200,6 +203,7 @@ class Ear:
     def time(self, name: str, topic: str, kind: type = JointState, qos: Any = RELIABLE) -> None:
         """Note the first receipt of each stamp on a topic."""
         received = self.received.setdefault(name, {})
+        self.topics[name] = topic
 
         def on_message(cdr: bytes) -> None:
             seconds, rest = STAMP.unpack_from(cdr, 4)
@@ -306,6 +310,41 @@ def percentiles(delays: FloatArray, what: str, late: int = 99) -> dict[str, floa
         raise SystemExit(f"nothing came through {what}")
     median, last = np.percentile(delays, [50, late])
     return {"median_ms": round(float(median), 3), f"p{late}_ms": round(float(last), 3), "frames": len(delays)}
+
+
+@contextlib.contextmanager
+def graph_of(
+    bench: Bench,
+    listeners: Mapping[str, int],
+    *,
+    poses: Mapping[str, SensorPose] | None = None,
+    further: Iterable[Sequence[str]] = (),
+    level: str = "WARN",
+    **options: Any,
+) -> Iterator[list[subprocess.Popen[bytes]]]:
+    """The nodes of a graph as processes, once they have subscribed; then the bench spins, and closes at the end.
+
+    Args:
+        bench: publishes the sensors' messages.
+        listeners: by topic, the number of subscribers to wait for.
+        poses: of the sensors, for a calibration.
+        further: more command lines.
+        level: of the nodes' logging.
+        options: of the graph.
+    """
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        stack.callback(bench.close)
+        if poses is not None:
+            options["calibration"] = calibrated(folder / "calibration.yaml", poses)
+        lines = [*node_commands(folder, options_of(**options), level), *further]
+        running = stack.enter_context(processes(lines))
+        outputs = [bench.topics[name] for name in bench.received]
+        wait("the nodes", lambda: bench.connected(listeners), running, 120.0)
+        wait("their output", lambda: any(map(bench.node.count_publishers, outputs)), running)
+        time.sleep(1.0)
+        bench.spin()
+        yield running
 
 
 class Stream:

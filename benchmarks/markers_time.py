@@ -18,7 +18,7 @@ import itertools
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -51,7 +51,6 @@ from body_tracking.pipeline.stage import Now, Stage
 from body_tracking.recording.rosbag2 import BAG_WIRE
 from body_tracking.simulation.marker_bags import SEED, images
 from body_tracking.simulation.marker_scene import MarkerScene, make_targets, marker_scene, stereo_rig
-from body_tracking.systems import options_of
 
 RATE, FRAMES = 60.0, 60
 BARS_MS = {"median": 4.0, "p99": 10.0, "scratch": 8.0}
@@ -226,28 +225,14 @@ def measured_live(pairs: Pairs, seconds: float, warm_up: float) -> dict[str, Any
             for topic, message in zip(topics, messages[index], strict=True):
                 yield number / RATE, topic, message
 
-    output = graph.joint_states_topic(setup.BODY)
     bench = live.Bench("markers_time")
     for topic in topics:
         bench.publisher(topic, Image, IMAGES)
-    bench.time("angles", output)
-    with tempfile.TemporaryDirectory() as folder:
-        options = options_of(sensors=(), marker_setup=str(pairs.folder))
-        try:
-            with live.processes(live.node_commands(Path(folder), options)) as running:
-                live.wait("the nodes", lambda: bench.connected(dict.fromkeys(topics, 1)), running)
-                live.wait(
-                    "the last node",
-                    lambda: bench.node.count_publishers(output) > 0,
-                    running,
-                )
-                time.sleep(1.0)
-                bench.spin()
-                until = itertools.takewhile(lambda event: event[0] < warm_up + seconds, events())
-                late = bench.publish(until, {topics[0]: "angles"}, warm_up)
-                time.sleep(1.0)
-        finally:
-            bench.close()
+    bench.time("angles", graph.joint_states_topic(setup.BODY))
+    with live.graph_of(bench, dict.fromkeys(topics, 1), sensors=(), marker_setup=str(pairs.folder)):
+        until = itertools.takewhile(lambda event: event[0] < warm_up + seconds, events())
+        late = bench.publish(until, {topics[0]: "angles"}, warm_up)
+        time.sleep(1.0)
     delays, lost = bench.delays_ms("angles")
     found = (
         live.percentiles(delays, "the graph", 95)
@@ -258,23 +243,6 @@ def measured_live(pairs: Pairs, seconds: float, warm_up: float) -> dict[str, Any
 
 
 # --- the command
-
-
-def show(figures: Mapping[str, Any]) -> None:
-    """Print the tables."""
-    for name, found in figures.items():
-        row = found["computation"]
-        print(f"{name}: reference {row['reference']:.2f} ms wall, {row['cpu reference']:.2f} cpu")
-        for key in ("median", "p99", "scratch"):
-            cpu = row[f"cpu {key}"]
-            print(
-                f"   {key:8} {row[key]:8.2f} ms ({row[key] / row['reference']:.1f} references), cpu {cpu:.2f} ms "
-                f"({cpu / row['cpu reference']:.1f})"
-            )
-        print("   cpu median of: " + ", ".join(f"{step} {value:.2f}" for step, value in row["steps"].items()))
-        print(f"   angles of {100.0 * row['angles']:.1f} % of the pairs")
-        if "live" in found:
-            print("   live: " + ", ".join(f"{key} {value:g}" for key, value in found["live"].items()))
 
 
 def main() -> int:
@@ -299,7 +267,7 @@ def main() -> int:
             for name, pairs in made.items():
                 common.progress(f"{name}: live")
                 figures[name]["live"] = measured_live(pairs, args.seconds, 3.0)
-    common.report(args, figures, lambda: show(figures))
+    common.report(args, figures)
     row = figures["balls apart"]["computation"]
     met = {f"balls apart, {key} {row[key]:.2f} ms, at most {bar:g}": row[key] <= bar for key, bar in BARS_MS.items()}
     if not args.no_live:

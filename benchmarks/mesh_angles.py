@@ -13,12 +13,12 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import common
 import numpy as np
-from common import ABSENT, NORMAL, mapped, report, verdicts
-from mesh_runs import fit_from_truth, is_absent, scene_of
+from common import NORMAL, report, verdicts
+from mesh_runs import Job, fit_from_truth, runs_of, scene_of
 
 from body_tracking.core.joint_angles import JointAngles
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Skeleton, TrackingState
@@ -42,14 +42,6 @@ MESH, KINECT, FLOOR = "mesh and sensors", "kinect", "floor"
 FILTERS = {"default": DEFAULT_FILTER, "ekf": "ekf"}
 _FOREARMS = ("forearm_left", "forearm_right")
 _SETTLED_S = 1.0
-
-
-class Job(NamedTuple):
-    """One person in one motion."""
-
-    motion: str
-    seed: int
-    seconds: float
 
 
 def run(job: Job) -> dict[str, dict[str, tuple[FloatArray, FloatArray]]]:
@@ -121,13 +113,7 @@ def figures_of(off: FloatArray, stated: FloatArray) -> dict[str, float]:
 
 def main() -> int:
     """The benchmark."""
-    parser = common.parser(__doc__, seeds=4, motions=MOTIONS, jobs=True)
-    parser.add_argument("--seconds", type=float, default=10.0, help="of each motion, at most (10)")
-    arguments = parser.parse_args()
-    if is_absent():
-        return ABSENT
-    jobs = [Job(motion, seed, arguments.seconds) for motion in arguments.motions for seed in range(arguments.seeds)]
-    runs = mapped(run, jobs, arguments.jobs)
+    arguments, jobs, runs = runs_of(run, __doc__, MOTIONS, seeds=4, seconds=10.0)
     table: dict[str, dict[str, str]] = {}
     met: dict[str, bool] = {}
     for kind in ANGLES:

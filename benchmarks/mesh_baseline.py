@@ -13,13 +13,11 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
-import common
 import numpy as np
-from common import ABSENT, mapped, report, verdicts
+from common import report, verdicts
 from mesh_hidden import SEGMENTS, orientations_at, worn
-from mesh_runs import ARMS, JOINTS, SIDES, is_absent, kinect_skeletons, mesh_stage, scene_of, skeleton_of
+from mesh_runs import ARMS, JOINTS, SIDES, Job, kinect_skeletons, mesh_stage, runs_of, scene_of, skeleton_of
 
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.mesh.depth import DepthCamera, to_metres
@@ -33,14 +31,6 @@ MOTIONS = ("reaching", "two_handed_wave")
 SOURCES = ("ours", "jatesiktat", "jatesiktat, mean of 3", "kinect")
 _BEGIN = 3.0
 """Seconds of the motion before the comparison: ours has seen several poses by then."""
-
-
-class Job(NamedTuple):
-    """One person in one motion."""
-
-    motion: str
-    seed: int
-    seconds: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,13 +114,8 @@ def figures_of(runs: Sequence[Run]) -> dict[str, dict[str, float]]:
 
 
 def main() -> int:
-    parser = common.parser(__doc__, seeds=2, motions=MOTIONS, jobs=True)
-    parser.add_argument("--seconds", type=float, default=2.0, help="of each motion (default: %(default)s)")
-    arguments = parser.parse_args()
-    if is_absent():
-        return ABSENT
-    jobs = [Job(motion, seed, arguments.seconds) for motion in arguments.motions for seed in range(arguments.seeds)]
-    figures = figures_of(mapped(run, jobs, arguments.jobs))
+    arguments, _, runs = runs_of(run, __doc__, MOTIONS, seeds=2, seconds=2.0)
+    figures = figures_of(runs)
     report(arguments, figures)
     ours, theirs = figures["ours"], figures["jatesiktat, mean of 3"]
     return verdicts(

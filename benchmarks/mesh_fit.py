@@ -14,12 +14,11 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
-import common
 import numpy as np
-from common import ABSENT, NORMAL, bone_correlation, mapped, report, verdicts
-from mesh_runs import ARMS, fit_from_truth, is_absent, kinect_skeletons, mesh_stage, scene_of
+from common import NORMAL, bone_correlation, report, verdicts
+from mesh_runs import ARMS, Job, fit_from_truth, kinect_skeletons, mesh_stage, runs_of, scene_of
 
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.mesh.depth import DepthCamera, to_metres
@@ -29,14 +28,6 @@ from body_tracking.simulation.depth_scene import SENSOR
 
 MOTIONS = ("reaching", "two_handed_wave", "torso_twist")
 _FLOOR = 10
-
-
-class Job(NamedTuple):
-    """One person in one motion."""
-
-    motion: str
-    seed: int
-    seconds: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,32 +116,11 @@ def figures_of(runs: Sequence[Run]) -> dict[str, Any]:
 
 
 def main() -> int:
-    parser = common.parser(__doc__, seeds=4, motions=MOTIONS, jobs=True)
-    parser.add_argument("--seconds", type=float, default=8.0, help="of each motion (default: %(default)s)")
-    arguments = parser.parse_args()
-    if is_absent():
-        return ABSENT
-    jobs = [Job(motion, seed, arguments.seconds) for motion in arguments.motions for seed in range(arguments.seeds)]
-    runs = mapped(run, jobs, arguments.jobs)
+    arguments, _, runs = runs_of(run, __doc__, MOTIONS, seeds=4, seconds=8.0)
     cases = {motion: figures_of([each for each in runs if each.job.motion == motion]) for motion in arguments.motions}
     cases["all"] = figures_of(runs)
 
-    def show() -> None:
-        print(f"{'mean, 95 %; mm':24}" + "".join(f"{name:>20}" for name in cases))
-        for row in (f"{name}{more}" for more in ("", " without offset") for name in ("mesh", "floor", "kinect")):
-            cells = (f"{each[row][0]:.1f}, {each[row][1]:.1f}" for each in cases.values())
-            print(f"{row:24}" + "".join(f"{cell:>20}" for cell in cells))
-        rows = {
-            "NEES": lambda each: f"{each['nees']:.2f}",
-            "in 1.96 sd": lambda each: f"{each['within']:.1%}",
-            "bone correlation": lambda each: f"{each['bone correlation']:.2f}",
-            "lost of images": lambda each: f"{each['lost']} of {each['images']}",
-            "ms, median and 99 %": lambda each: f"{each['ms'][0]:.1f}, {each['ms'][1]:.1f}",
-        }
-        for row, cell in rows.items():
-            print(f"{row:24}" + "".join(f"{cell(each):>20}" for each in cases.values()))
-
-    report(arguments, cases, show)
+    report(arguments, cases)
     every = cases["all"]
     return verdicts(
         arguments,

@@ -27,18 +27,18 @@ from typing import Any, NamedTuple
 
 import common
 import numpy as np
-from common import ABSENT, mapped, report, rms, rms_deg, verdicts
+from common import mapped, report, rms, rms_deg, verdicts
 from mesh_runs import (
     ARMS,
     ekf_stage,
     fed,
     fit_from_truth,
-    is_absent,
     kinect_skeletons,
     mesh_stage,
     people,
     scene_of,
     skeleton_of,
+    wheel,
 )
 
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, Joint, Skeleton, TrackingState
@@ -459,8 +459,7 @@ def main() -> int:
     )
     parser.add_argument("--starts", type=int, default=200, metavar="N", help="who walk in (default: %(default)s)")
     arguments = parser.parse_args()
-    if is_absent():
-        return ABSENT
+    wheel()
     jobs = [Job("fast", motion, seed) for motion in (*FAST, _PUNCHING) for seed in range(arguments.seeds)]
     jobs += [Job("walk in", "", seed) for seed in range(arguments.starts)]
     jobs += [Job(case, "", seed) for case in ("bend", "shrug") for seed in range(arguments.seeds)]

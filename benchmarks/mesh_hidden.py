@@ -15,14 +15,12 @@ import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
-import common
 import cv2
 import numpy as np
-from common import ABSENT, NORMAL, mapped, report, verdicts
+from common import NORMAL, report, verdicts
 from imu_and_camera import aligned
-from mesh_runs import SIDES, ekf_stage, fed, fit_from_truth, is_absent, kinect_skeletons, mesh_stage, scene_of
+from mesh_runs import SIDES, Job, ekf_stage, fed, fit_from_truth, kinect_skeletons, mesh_stage, runs_of, scene_of
 
 from body_tracking.core.camera import Camera
 from body_tracking.core.orientation import SegmentOrientation
@@ -59,14 +57,6 @@ _BOARD = 0.5
 """Distance of the board from the camera as a share of the arm's."""
 _FLOOR = 3
 """The floor is computed for every third image with a hidden forearm."""
-
-
-class Job(NamedTuple):
-    """One person in one motion."""
-
-    motion: str
-    seed: int
-    seconds: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -268,26 +258,14 @@ def figures_of(runs: Sequence[HiddenRun], *, offset: bool = True) -> dict[str, d
 
 
 def main() -> int:
-    parser = common.parser(__doc__, seeds=3, motions=MOTIONS, jobs=True)
-    parser.add_argument("--seconds", type=float, default=8.0, help="of each motion (default: %(default)s)")
-    arguments = parser.parse_args()
-    if is_absent():
-        return ABSENT
-    jobs = [Job(motion, seed, arguments.seconds) for motion in arguments.motions for seed in range(arguments.seeds)]
-    runs = mapped(run, jobs, arguments.jobs)
+    arguments, _, runs = runs_of(run, __doc__, MOTIONS, seeds=3, seconds=8.0)
     tables = {
         "as they are": figures_of(runs),
         "without constant offsets": figures_of(runs, offset=False),
         **{motion: figures_of([each for each in runs if each.job.motion == motion]) for motion in arguments.motions},
     }
 
-    def show() -> None:
-        for title, figures in tables.items():
-            print(f"{title:26}" + "".join(f"{row:>18}" for row in figures["mesh"]))
-            for name, each in figures.items():
-                print(f"{name:26}" + "".join(f"{value:>18.1f}" for value in each.values()))
-
-    report(arguments, tables, show)
+    report(arguments, tables)
     figures = tables["as they are"]
     without, sensor, kinect = (figures[name] for name in ("mesh", "mesh+sensor", "kinect"))
     return verdicts(

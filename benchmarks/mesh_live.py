@@ -10,11 +10,9 @@ camera at 30 Hz loses no image, and its delay does not grow.
 from __future__ import annotations
 
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import common
@@ -30,7 +28,6 @@ from body_tracking.messages.codecs import Pose
 from body_tracking.pipeline import graph
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, RawMessage
 from body_tracking.simulation.depth_bags import SHIPPED
-from body_tracking.systems import options_of
 
 RECORDED = "kinect1"
 FOREARMS = ("forearm_left", "forearm_right")
@@ -80,28 +77,18 @@ def measured(cameras: int, every: int, imus: tuple[str, ...]) -> dict[str, Any]:
         bench.publisher(info_topic(name), CameraInfo, LATCHED)
     for segment in imus:
         bench.publisher(_imu_topic(segment), Imu)
-    angles = graph.joint_states_topic(graph.DEFAULT_BODY)
-    bench.time("angles", angles)
+    bench.time("angles", graph.joint_states_topic(graph.DEFAULT_BODY))
     bench.hear_diagnostics()
     sensors = [mesh_sensor(name) for name in names]
     _, pose, _ = recorded()
     poses = {name: replace(pose, sensor=name) for name in sensors}
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch)
-        calibration = live.calibrated(folder / "calibration.yaml", poses)
-        options = options_of(sensors=(), depth=tuple(names), imus=imus, calibration=calibration)
-        with live.processes(live.node_commands(folder, options), folder / "log") as running:
-            inputs = {depth_topic(name): 1 for name in names} | {_imu_topic(segment): 1 for segment in imus}
-            live.wait("the nodes", lambda: bench.connected(inputs), running)
-            live.wait("the last node", lambda: bench.node.count_publishers(angles) > 0, running)
-            time.sleep(1.0)
-            bench.spin()
-            sent = list(events(names, every, imus))
-            since = 1.0 + (sent[-1][0] - 1.0) / ROUNDS
-            late = bench.publish(sent, {depth_topic(names[0]): "angles"}, since)
-            time.sleep(2.5)
-        counters = [dict(bench.values(name)) for name in sensors]
-    bench.close()
+    inputs = {depth_topic(name): 1 for name in names} | {_imu_topic(segment): 1 for segment in imus}
+    with live.graph_of(bench, inputs, poses=poses, sensors=(), depth=tuple(names), imus=imus):
+        sent = list(events(names, every, imus))
+        since = 1.0 + (sent[-1][0] - 1.0) / ROUNDS
+        late = bench.publish(sent, {depth_topic(names[0]): "angles"}, since)
+        time.sleep(2.5)
+    counters = [dict(bench.values(name)) for name in sensors]
     delays, lost = bench.delays_ms("angles")
     rounds = [float(np.median(each)) for each in np.array_split(delays, ROUNDS - 1)]
     return {

