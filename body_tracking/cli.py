@@ -74,6 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         arguments = sys.argv[1:]
     arguments = _joined(arguments)
+    args: argparse.Namespace | None = None
     try:
         if not arguments:
             from body_tracking.ros import advice
@@ -85,6 +86,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"body_tracking: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
+        output = getattr(args, "output", None)
+        left = f"; {output} was not written" if output is not None and not output.exists() else ""
+        print(f"body_tracking: interrupted{left}", file=sys.stderr)
         return 130
     except BrokenPipeError:
         # The reader of our output has ended, as `head` does; Python would raise again when it flushes at exit.

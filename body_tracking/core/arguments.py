@@ -16,7 +16,7 @@ class Parser(argparse.ArgumentParser):
     meant: Mapping[str, str] = MappingProxyType({})
     """Command lines for words that are none of the choices."""
     about_bag = ""
-    """What to do with a recording, in a command that takes none."""
+    """What to do with a recording, where none is expected."""
 
     def error(self, message: str) -> NoReturn:
         """Exit with code 2."""
@@ -46,4 +46,6 @@ class Parser(argparse.ArgumentParser):
             raise argparse.ArgumentError(action, f"invalid choice: {value!r}; did you mean {self.meant[value]!r}?")
         if action.choices is not None and value not in action.choices and (hint := did_you_mean(value, action.choices)):
             raise argparse.ArgumentError(action, f"invalid choice: {value!r}{hint}")
+        if action.choices is not None and value not in action.choices and self.about_bag:
+            raise argparse.ArgumentError(action, f"invalid choice: {value!r}; {self.about_bag}")
         super()._check_value(action, value)

@@ -30,6 +30,8 @@ MAX_CAMERAS: Final = 32
 POSE: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
 _BALL: Final[Fields] = tuple((name, FLOAT32) for name in ("u", "v", "area", "uu", "uv", "vv"))
 _POINT: Final[Fields] = POSITION + COVARIANCE
+_SINGLE: Final = 2.0**-23
+"""Share of a covariance's trace that exceeds its error in single precision."""
 _INDEX: Final[Fields] = tuple((f"ball{camera}", INT32) for camera in range(MAX_CAMERAS))
 
 
@@ -61,11 +63,15 @@ def cloud_to_balls(cloud: Any) -> ImageBalls:
 def points_to_cloud(points: Points, types: MessageTypes) -> Any:
     """Cloud with the fields ``x y z``, the covariance, and ``ball0``, ``ball1``, ...: the ball's index in each
     camera.
+
+    In single precision the covariance of two balls that do not belong together, whose rays are almost parallel, would
+    not be positive definite: so much is added that it is.
     """
     fields = _POINT + _INDEX[: points.balls.shape[1]]
     rows = np.empty(len(points.positions), dtype=record_of(fields))
     rows["x"], rows["y"], rows["z"] = points.positions.T
-    put_covariance(rows, points.covariance)
+    size = np.trace(points.covariance, axis1=1, axis2=2)
+    put_covariance(rows, points.covariance + _SINGLE * size[:, None, None] * np.eye(3))
     for (name, _), index in zip(_INDEX, points.balls.T, strict=False):
         rows[name] = index
     return make_cloud(rows, fields, points.stamp_ns, points.frame_id, types)

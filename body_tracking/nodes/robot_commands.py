@@ -57,6 +57,7 @@ _UNPAIRED = 16
 """Stamps whose angles or standard deviations may wait for their counterpart."""
 _LOOK_AROUND_NS = 4_000_000_000
 """Time after which a node has found all other publishers: DDS announces them at least every 3 s."""
+_SWITCHED = "of another publisher than before (a restarted node, or two at a time)"
 _LEVELS = {State.FOLLOWING: 0, State.APPROACHING: 0, State.HOLDING: 1, State.STOPPED: 2}
 
 
@@ -104,11 +105,8 @@ class RobotCommands(GraphNode):
 
     def on_angles(self, topic: str, message: JointState, sent_ns: int) -> None:
         """Pair angles and their standard deviations by stamp, and pass pairs to the follower."""
-        if self.sequences.switched[topic] != self.switched[topic]:
-            self.switched[topic] = self.sequences.switched[topic]
-            self.follower.refuse_angles(
-                f"{topic}: angles of another publisher than before (a restarted node, or two at a time)"
-            )
+        if self.has_switched(topic):
+            self.follower.refuse_angles(f"{topic}: angles {_SWITCHED}")
         stamp_ns = to_nanoseconds(message.header.stamp)
         self.monitor.message_in(topic, stamp_ns)
         pair = self.waiting.setdefault(stamp_ns, {})
@@ -144,6 +142,9 @@ class RobotCommands(GraphNode):
                 self.follower.calibration.receive_quality(quality, time.monotonic_ns())
 
     def on_robot(self, message: JointState, sent_ns: int) -> None:
+        topic = self.resolve_topic_name(self.mapping.output.state_topic)
+        if self.has_switched(topic):
+            self.follower.refuse_robot_state(f"{topic}: joint states {_SWITCHED}")
         position = np.array(message.position, dtype=np.float64)
         self.follower.receive_robot_state(tuple(message.name), position, time.monotonic_ns())
 
@@ -154,6 +155,11 @@ class RobotCommands(GraphNode):
         except FollowerError as error:
             response.message = str(error)
         return response
+
+    def has_switched(self, topic: str) -> bool:
+        """Whether this message of a topic is of another publisher than the one before."""
+        before, self.switched[topic] = self.switched[topic], self.sequences.switched[topic]
+        return self.switched[topic] != before
 
     def others(self) -> str:
         """A line that names other publishers of the robot's commands or says that the search goes on; else empty."""

@@ -14,9 +14,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from body_tracking.core.arguments import Parser
 from body_tracking.core.qos import Qos
 from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.recording.rosbag2 import BagError, BagReader, TopicInfo, recover
+
+_OWN_CLOCK_S = 1e9
+"""An earlier start, before 2001, is that of a clock that began at some time of its own, and no date; seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,10 +105,11 @@ def _qos_text(offers: tuple[Qos, ...]) -> str:
 
 def _print(info: BagInfo) -> None:
     size = sum(info.files.values())
-    start = datetime.fromtimestamp(round(info.start_ns / NANOSECONDS, 3), UTC)  # the seconds agree with those beside
+    start_s = round(info.start_ns / NANOSECONDS, 3)
+    date = f" ({datetime.fromtimestamp(start_s, UTC):%Y-%m-%d %H:%M:%S} UTC)" if start_s > _OWN_CLOCK_S else ""
     print(f"bag       {info.path}")
     print(f"files     {', '.join(info.files)} ({size / 1e6:.2f} MB)")
-    print(f"start     {info.start_ns / NANOSECONDS:.3f} s ({start:%Y-%m-%d %H:%M:%S} UTC)")
+    print(f"start     {start_s:.3f} s{date}")
     print(f"duration  {info.duration_s:.3f} s")
     print(f"messages  {info.messages}")
     rows = [("topic", "type", "count", "rate", "qos")]
@@ -125,6 +130,8 @@ def _print(info: BagInfo) -> None:
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add ``bag info`` and ``bag recover`` to the ``body_tracking`` command."""
     parser = subparsers.add_parser("bag")
+    if isinstance(parser, Parser):
+        parser.about_bag = "'bag info BAG' lists what a recording holds"
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
     info = verbs.add_parser("info", help="list the contents of a bag, and what is missing")
     info.add_argument("bag", type=Path, metavar="BAG", help="a folder, or a single mcap file")

@@ -221,6 +221,10 @@ class Follower:
         """Report angles that must not be followed: a fault until valid angles arrive, and for one command at least."""
         self._angle_fault = self._refusal = reason
 
+    def refuse_robot_state(self, reason: str) -> None:
+        """Report joint states that may be another robot's: a fault for one command at least."""
+        self._refusal = reason
+
     def _foreign(self, names: tuple[str, ...], convention: str) -> str:
         """Why these angles do not match the mapping; empty if they do."""
         mapping = self.mapping

@@ -92,6 +92,16 @@ def test_points_round_trip(types: MessageTypes, cameras: int) -> None:
     np.testing.assert_array_equal(found.balls, balls)
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_a_point_of_almost_parallel_rays_does_not_cost_the_others_of_its_frame(types: MessageTypes, seed: int) -> None:
+    turned = Rotation.random(random_state=seed).as_matrix()
+    covariance = np.stack([1e-9 * np.eye(3), turned @ np.diag([5e-10, 9e-10, 1.4]) @ turned.T])
+    points = Points(STAMP_NS, "world", np.ones((2, 3)), covariance, np.empty((2, 0), np.intp))
+    found = cloud_to_points(points_to_cloud(points, types))
+    np.testing.assert_allclose(found.covariance[0], covariance[0], rtol=1e-6, atol=1e-15)
+    np.testing.assert_allclose(found.covariance[1], covariance[1], atol=1e-6)
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e9])
 def test_points_without_a_place_are_refused(types: MessageTypes, bad: float) -> None:
     points = Points(STAMP_NS, "world", np.full((1, 3), bad), spread(1, 3), np.empty((1, 0), np.intp))

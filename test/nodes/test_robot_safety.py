@@ -46,6 +46,7 @@ ROBOTS = {
     "standstill": True,
     "unknown": False,
     "angles": True,
+    "twin": True,
 }
 
 
@@ -79,6 +80,7 @@ class Robot:
         convention: of the angles.
         names: of the angles.
         doubled: whether a second publisher sends the opposite angle.
+        second_states: a second publisher of the arm's position.
         position: of the arm, radians; it follows the commands while ``released``.
         commands: received ones, radians.
     """
@@ -92,6 +94,7 @@ class Robot:
         self.commands: list[float] = []
         kinds = (graph.joint_states_topic(name), graph.joint_states_stddev_topic(name))
         self.publishers = [[bench.node.create_publisher(JointState, topic, 10) for topic in kinds] for _ in range(2)]
+        self.second_states: Any = None
         self.states = bench.node.create_publisher(JointState, f"/{name}/joint_states", 10)
         bench.node.create_subscription(Float64MultiArray, f"/{name}/commands", self._on_command, RELIABLE)
 
@@ -106,7 +109,8 @@ class Robot:
 
     def publish(self, now_ns: int) -> None:
         """Publish the person's angles and the arm's position."""
-        self.states.publish(JointState(name=["shoulder"], position=[self.position]))
+        for publisher in filter(None, (self.states, self.second_states)):
+            publisher.publish(JointState(name=["shoulder"], position=[self.position]))
         stamp_ns = now_ns - round(self.age * NANOSECONDS)
         for number, publishers in enumerate(self.publishers[: 1 + self.doubled]):
             position = np.zeros(len(self.names))
@@ -310,6 +314,16 @@ def test_angles_of_two_alternating_publishers_are_refused(bench: Bench) -> None:
     assert any(robot.is_told_nothing() for _ in range(4))
     assert min(robot.commands) > -0.1  # and the other one was never followed
     robot.doubled = False
+    robot.until_it_follows()
+
+
+def test_joint_states_of_two_robots_on_one_topic_are_refused(bench: Bench) -> None:
+    robot = bench.robot("twin")
+    robot.until_it_follows()
+    robot.second_states = bench.node.create_publisher(JointState, "/twin/joint_states", 10)
+    robot.until_it_says("stopped", "/twin/joint_states: joint states of another publisher than before")
+    assert any(robot.is_told_nothing() for _ in range(4))  # a busy machine may deliver only those of one for a while
+    robot.second_states = None
     robot.until_it_follows()
 
 
