@@ -80,7 +80,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             from body_tracking.ros import advice
 
             return advice.run()
-        args = parser(arguments[0] if arguments else None).parse_args(arguments)
+        chosen = parser(arguments[0])
+        if arguments[0].startswith("-") and len(arguments) > 1:
+            chosen.error(f"{arguments[0]}: options come after the command: body_tracking COMMAND {arguments[0]} ...")
+        args = chosen.parse_args(arguments)
         code: int = args.run(args)
     except BodyTrackingError as error:
         print(f"body_tracking: {error}", file=sys.stderr)

@@ -122,10 +122,10 @@ def add_options(parser: argparse.ArgumentParser, *names: str, **texts: str) -> N
         flag, text = f"--{option.name.replace('_', '-')}", texts.get(option.name, option.text)
         if isinstance(option.default, bool):
             group.add_argument(flag, action="store_true", help=text)
-        elif isinstance(option.default, tuple) and option.name != "sensors":
+        elif isinstance(option.default, tuple):
             group.add_argument(flag, action="append", metavar=option.metavar, help=text)
         else:
-            kind = Path if option.path else str if isinstance(option.default, tuple) else type(option.default)
+            kind = Path if option.path else type(option.default)
             choices = None if option.choices is None else tuple(option.choices())
             metavar = option.metavar or None
             default = option.default if isinstance(option.default, int | float) else None
@@ -143,14 +143,12 @@ def options_from(args: argparse.Namespace) -> dict[str, Value]:
         value = getattr(args, name, None)
         if value is None:
             continue
-        if name == "sensors" and value == graph.NO_SENSORS:
-            value = ()
-        elif name == "sensors":
-            value = tuple(each for each in value.split(",") if each)
-            if not value:
-                raise graph.GraphError("sensors: no name")
-        elif isinstance(option.default, tuple):
+        if isinstance(option.default, tuple):
             value = tuple(part for each in value for part in each.split(",") if part)
+        if name == "sensors" and not value:
+            raise graph.GraphError("sensors: no name")
+        if name == "sensors" and value == (graph.NO_SENSORS,):
+            value = ()
         found[name] = tuple(value) if isinstance(option.default, tuple) else str(value) if option.path else value
     return found
 

@@ -37,8 +37,7 @@ def words(context: LaunchContext) -> list[str]:
                 raise UpError(f"{option.name}:={value}: expected true or false")
             found += [flag] * TRUTH[value.lower()]
         elif value:
-            several = isinstance(option.default, tuple) and option.name != "sensors"
-            found += [f"{flag}={each}" for each in (value.split(",") if several else [value])]
+            found.append(f"{flag}={value}")
     return found
 
 

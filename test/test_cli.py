@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from body_tracking import cli
 from body_tracking.core.message_types import JOINT_STATE
 from body_tracking.recording.rosbag2 import BagWriter
 from body_tracking.ros import advice
+from body_tracking.systems import options_from
 
 ROOT = Path(__file__).resolve().parent.parent
 COMMANDS = ("import", "bag info", "replay", "calibrate", "up", "doctor", "call", "show", "evaluate", "make-bags")
@@ -52,7 +54,7 @@ def test_without_a_command_it_says_what_to_do_next(nobody: Path, capsys: pytest.
     with BagWriter(nobody / "session") as writer:
         writer.add_topic("/humans/bodies/body1/joint_states", JOINT_STATE)
     assert "Recordings in this folder: session, bags/mine." in (text := said())
-    assert "  body_tracking show session\n  body_tracking up --bag session" in text
+    assert "  body_tracking show session\n  body_tracking up --bag session" in text and "replay" not in text
     (nobody / "lab.yaml").write_text("kinect1_skeleton: {ros__parameters: {backend: network}}")
     assert "  body_tracking up --params-file lab.yaml" in said()
 
@@ -127,6 +129,14 @@ def test_missing_files_are_reported_in_one_line(
         ),
         ("play bags/wave", "argument COMMAND: invalid choice: 'play'; did you mean 'up --bag BAG'?", "body_tracking"),
         ("record", "argument COMMAND: invalid choice: 'record'; did you mean 'up --record NEW_BAG'?", "body_tracking"),
+        ("bag bags/wave", "argument VERB: invalid choice: 'bags/wave'; 'bag info BAG' lists", "body_tracking bag"),
+        ("bag inf bags/wave", "argument VERB: invalid choice: 'inf'; did you mean 'info'?", "body_tracking bag"),
+        ("--filter ekf replay bag -o out", "--filter: options come after the command", "body_tracking"),
+        (
+            "simulate --around -40,40 -o out",
+            "argument --around: expected one argument; write --around=-40,40",
+            "body_tracking simulate",
+        ),
         ("up --filter xyz", "argument --filter: invalid choice: 'xyz' (choose from ", "body_tracking up"),
     ],
 )
@@ -156,6 +166,18 @@ def test_a_recording_to_play_is_the_first_option_of_up(capsys: pytest.CaptureFix
     usage = capsys.readouterr().out
     assert usage.index("[--bag BAG]") < usage.index("[--sensors")
     assert usage.index("playing and recording:") < usage.index("skeletons, calibration and people:")
+
+
+@pytest.mark.parametrize(
+    ("words", "sensors"),
+    [
+        (["--sensors", "kinect1", "--sensors", "kinect2,kinect3"], ("kinect1", "kinect2", "kinect3")),
+        (["--sensors", "none"], ()),
+        ([], None),
+    ],
+)
+def test_sensors_may_be_a_list_or_repeated(words: list[str], sensors: tuple[str, ...] | None) -> None:
+    assert options_from(cli.parser("up").parse_args(["up", *words])).get("sensors") == sensors
 
 
 TAKEN = (
@@ -192,6 +214,29 @@ def test_data_are_replaced_only_where_the_command_says_so(
     with pytest.raises(SystemExit):
         cli.main([*words.partition(" -")[0].split(), "--help"])
     assert "--overwrite" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_ctrl_c_says_what_became_of_the_output(
+    there: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cli, "parser", lambda command: Interrupted())
+    if there:
+        (tmp_path / "out").mkdir()
+    assert cli.main(["replay", "bag", "-o", "out"]) == 130
+    left = "" if there else "; out was not written"
+    assert capsys.readouterr().err == f"body_tracking: interrupted{left}\n"
+
+
+class Interrupted:
+    """A parser of a command that ends with Ctrl-C."""
+
+    def parse_args(self, arguments: list[str]) -> argparse.Namespace:
+        return argparse.Namespace(output=Path("out"), run=self.run)
+
+    def run(self, args: argparse.Namespace) -> int:
+        raise KeyboardInterrupt
 
 
 def test_closed_stdout_is_no_error() -> None:

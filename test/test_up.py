@@ -254,6 +254,15 @@ def refusal(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
     return lines[0]
 
 
+def test_a_graph_that_cannot_start_leaves_no_recording(up: Callable[..., Up], tmp_path: Path) -> None:
+    file, session = tmp_path / "sensors.yaml", tmp_path / "session"
+    file.write_text("kinect1_skeleton: {ros__parameters: {backend: network, key_file: /nowhere}}")
+    graph_up = up("--sensors", "kinect1", "--params-file", file, "--record", session)
+    assert graph_up.process.wait(120.0) == 2
+    assert "body_tracking: kinect_skeleton: parameter 'key_file': /nowhere: cannot be read" in graph_up.text()
+    assert not session.exists()
+
+
 def test_invalid_bag_or_bag_without_skeletons_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert "nowhere" in refusal(capsys, "--bag", tmp_path / "nowhere")
     with BagWriter(tmp_path / "other") as writer:

@@ -114,7 +114,7 @@ def _instead(topic: str, topics: Collection[str]) -> str:
         return f" (it comes compressed: --compressed {'both' if depth else 'colour'})"
     if own:
         return f"; of {camera} it has {', '.join(own)}"
-    cameras = sorted({each.split("/")[1] for each in topics if each.endswith("/camera_info")})
+    cameras = sorted({each.split("/")[1] for each in topics if each.endswith("/camera_info") or "/image_raw" in each})
     return f"; it has the cameras {', '.join(cameras)}" if cameras else "; it has no camera"
 
 

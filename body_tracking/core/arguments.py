@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+import re
+import sys
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NoReturn
 
@@ -17,13 +19,23 @@ class Parser(argparse.ArgumentParser):
     """Command lines for words that are none of the choices."""
     about_bag = ""
     """What to do with a recording, where none is expected."""
+    _given: Sequence[str] = ()
 
     def error(self, message: str) -> NoReturn:
         """Exit with code 2."""
-        self.exit(2, f"body_tracking: {message} (see {self.prog} --help)\n")
+        self.exit(2, f"body_tracking: {message}{self._minus(message)} (see {self.prog} --help)\n")
+
+    def _minus(self, message: str) -> str:
+        """What to write where the value of an option begins with a minus sign, which argparse takes for an option."""
+        missing = re.fullmatch(r"argument (?:-\w/)?(--[\w-]+): expected one argument", message)
+        if missing and missing[1] in self._given[:-1]:
+            value = self._given[self._given.index(missing[1]) + 1]
+            return f"; write {missing[1]}={value}" if re.match(r"-[\d.]", value) else ""
+        return ""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """As the base class; exits for an unknown argument, which argparse would leave to the outermost parser."""
+        self._given = sys.argv[1:] if args is None else list(args)
         found, unknown = super().parse_known_args(args, namespace)
         if unknown:
             self.error(f"unrecognized arguments: {' '.join(unknown)}{self._hint(unknown[0])}")

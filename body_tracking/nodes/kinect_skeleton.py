@@ -38,7 +38,7 @@ class KinectSkeleton(GraphNode):
     def start(self) -> None:
         """Open the source, and start the thread that reads its frames."""
         given: dict[str, Any] = dict(self.values)
-        self.failure = ""
+        self.failure = self.problem = ""
         self.source_errors: dict[str, str] = {}
         sensor = check_sensor_name(given["sensor"])
         settings = SourceSettings(**fields_of(SourceSettings, given))
@@ -84,6 +84,9 @@ class KinectSkeleton(GraphNode):
         problem = self.source_value("problem", "")
         if problem:
             self.log_throttled("problem", problem, _PROBLEM_PERIOD_S)
+        elif self.problem and not self.failure:
+            self.get_logger().info("frames arrive")
+        self.problem = problem
         text = self.failure or problem or ("ended" if self.source_value("ended", False) else "streaming")
         counters = dict(self.source_value("counters", {}))
         return (

@@ -156,7 +156,7 @@ def run(args: argparse.Namespace) -> int:
         )
     limits = f"{np.degrees(parameters.max_rotation_stddev):.1f} degrees and {1e3 * MAX_TRANSLATION_STDDEV:.0f} mm"
     verdict = f"not good enough: {status.text}; " if status.level else "good: "
-    print(f"{verdict}{quality(status)} (good is below {limits})")
+    print(f"{verdict}{quality(status)} at the person's place (good is below {limits})")
     if status.level:
         print(f"next: record again, and {next_step(status)}")
     print(f"saved to {args.output}" if args.output is not None else "not saved: -o FILE saves it")

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.errors import BodyTrackingError, did_you_mean
 from body_tracking.core.parameters import Value, check_all
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.markers import setup
@@ -46,6 +46,7 @@ from body_tracking.recording.progress import Progress
 from body_tracking.recording.replay import ReplaySettings, replay
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, check_new_bag
+from body_tracking.systems import NODES
 
 _VIEWS = 600
 """Approximate number of views of a labelled target: more views hardly add information."""
@@ -146,6 +147,11 @@ def fit_recording(bag_path: Path, folder: Path, joints: Sequence[JointDescriptio
     """
     rig = rig_in(folder)
     targets = {each.name: each for each in load_targets(setup.file_of(folder, setup.TARGETS, "target"))}
+    for joint in joints:
+        for name in (joint.parent, joint.child):
+            if name not in targets:
+                hint = did_you_mean(name, targets) or f"; there are {', '.join(targets)}"
+                raise MarkerCommandError(f"joint {joint.name}: no target {name!r} in {folder / setup.TARGETS}{hint}")
     frames = poses_of(bag_path, folder, diameter)
     sensitivities = [effects for poses in frames if (effects := calibration_effects(rig, targets, poses)) is not None]
     shapes = [shape_effects(rig, targets, poses) for poses in frames]
@@ -168,8 +174,10 @@ def calibrate(args: argparse.Namespace) -> int:
     for entry in args.camera:
         name, _, folder = entry.partition("=")
         files = sorted(path for path in Path(folder).glob("*") if path.is_file()) if folder else []
-        if not name or not files:
+        if not name or not folder:
             raise MarkerCommandError(f"camera {entry!r}: expected NAME=FOLDER, a folder with its images")
+        if not files:
+            raise MarkerCommandError(f"camera {name}: no file in {folder}, or no such folder")
         names.append(name)
         series.append([_image(path) for path in files])
     board = Chessboard(args.columns, args.rows, args.square)
@@ -286,7 +294,8 @@ def angles(args: argparse.Namespace) -> int:
         parameters={"marker_triangulation": {"diameter": args.diameter}},
     )
     found = replay(args.bag, args.output, settings, overwrite=args.overwrite)
-    counters = {name.partition(" ")[2]: count for name, count in found.counters.items()}  # without the nodes' names
+    parts = {name: name.partition(" ") for name in found.counters}
+    counters = {text if node in NODES else name: found.counters[name] for name, (node, _, text) in parts.items()}
     listed = ", ".join(f"{name}: {count}" for name, count in sorted(counters.items()))
     report = {"output": str(args.output), "frames": found.frames, "counters": counters}
     return _say(

@@ -218,11 +218,13 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
         overwrite: replace an existing ``out``.
 
     Raises:
-        ReplayError: no skeletons in the bag, or no images, balls or points of markers.
+        ReplayError: no skeletons in the bag, or no images, balls or points of markers; ``out`` is the bag itself.
         BagError: the bag cannot be read, or ``out`` cannot be written.
         CalibrationError: the calibration file belongs to other sensors.
     """
     began = time.perf_counter()
+    if bag_path.resolve() in (out.resolve(), *out.resolve().glob("*.mcap")):
+        raise ReplayError(f"{out}: is the recording itself; give another folder")
     with RigReader(bag_path) as bag:
         advice = advice_for({name: each.type_name for name, each in bag.topics.items()})
         topics = {} if _without(settings, bag) else sensor_topics(bag, settings.sensors, advice)

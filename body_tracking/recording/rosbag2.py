@@ -463,7 +463,11 @@ class BagWriter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, value: object, traceback: TracebackType | None) -> None:
-        self.close()
+        """Close the bag; after an exception or Ctrl-C discard it."""
+        if kind is None:
+            self.close()
+        else:
+            self.discard()
 
     def add_topic(self, topic: str, type_name: str, qos: Qos | Sequence[Qos] = quality.RELIABLE) -> None:
         """Add a topic; repeated calls with the same type have no effect.

@@ -82,7 +82,8 @@ def _angles(bag: BagReader, body: str) -> Iterator[str]:
                 shares[label_of(name)] = 100.0 * len(known) / len(stddevs)
         text = f"{body}, {limb}: {len(medians)} of {len(names_of_limb)} angles known"
         if medians:
-            size = " to ".join(dict.fromkeys((f"{min(medians):.1f}", f"{max(medians):.1f}")))
+            digits = 1 if min(medians) >= 1.0 else 3  # markers give hundredths of a degree
+            size = " to ".join(dict.fromkeys((f"{min(medians):.{digits}f}", f"{max(medians):.{digits}f}")))
             least = min(shares, key=lambda name: shares[name])
             rare = f" ({least} least often)" if round(shares[least]) < round(max(shares.values())) else ""
             share = f"at least {shares[least]:.0f} % of the frames" if shares[least] < 99.5 else "every frame"

@@ -84,18 +84,13 @@ def _recordings(folder: Path, page: str, *, live: bool) -> Iterator[Step]:
     names = [str(_short(each, folder)) if own else each.name for each in bags[:_SHOWN]]
     more = f" and {len(bags) - _SHOWN} more" if len(bags) > _SHOWN else ""
     first = _short(bags[0], folder)
-    shown = own and _holds_angles(bags[0])
-    commands = [f"body_tracking show {first}"] if shown else []
-    commands += [f"body_tracking up --bag {first}{page}"] if live else []
-    out = f"{first.stem}_angles"
-    yield (
-        f"Recordings {where}: {', '.join(names)}{more}. "
-        f"{'Show the angles of one, play it' if shown else 'Play one'}, or compute its angles offline:",
-        (
-            *commands,
-            f"body_tracking replay {first} -o {out}",
-        ),
-    )
+    play = [f"body_tracking up --bag {first}{page}"] if live else []
+    if own and _holds_angles(bags[0]):
+        what, commands = "Show the angles of one, or play it", [f"body_tracking show {first}", *play]
+    else:
+        what = "Play one, or compute its angles offline"
+        commands = [*play, f"body_tracking replay {first} -o {first.stem}_angles"]
+    yield f"Recordings {where}: {', '.join(names)}{more}. {what}:", tuple(commands)
 
 
 def _holds_angles(bag: Path) -> bool:

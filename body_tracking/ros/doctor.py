@@ -117,7 +117,7 @@ def clock(variables: Mapping[str, str]) -> Finding:
         return Finding(PROBLEM, f"the clock is in the past: {time.ctime()}", "sudo timedatectl set-ntp true")
     if ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(1024)) == 5:  # TIME_ERROR
         if not several_machines(variables):
-            return Finding(OK, "the clock is not synchronised, as only sensors on several machines need it")
+            return Finding(OK, "the clock is not synchronised, which only sensors on several machines need")
         return Finding(WARNING, "the clock is not synchronised", "sudo timedatectl set-ntp true, on every machine")
     return Finding(OK, "the clock is synchronised")
 

@@ -317,7 +317,10 @@ class Supervisor:
                 self._bag_start_ns = reader.start_ns
 
     def run(self, monitor: GraphMonitor) -> None:
-        """Run until the bag ends, a user ends the graph or a node cannot start (reason: :attr:`failure`)."""
+        """Run until the bag ends, a user ends the graph or a node cannot start (reason: :attr:`failure`).
+
+        A graph that could not start, and gave no angles, leaves no recording.
+        """
         handlers = {number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
         handlers[signal.SIGHUP] = signal.signal(signal.SIGHUP, self._on_signal)
         begin = time.monotonic()
@@ -351,6 +354,9 @@ class Supervisor:
         self.console.end()
         if self.failure:
             self.console.line(f"body_tracking: {self.failure}", error=True)
+            # else the next try would be refused
+            if self.options["record"] and (not monitor.angles or monitor.has_predecessor()):
+                shutil.rmtree(str(self.options["record"]), ignore_errors=True)
             return
         elapsed = time.monotonic() - begin
         played = any(child.done for child in self.children)
@@ -565,6 +571,7 @@ def _sensors_there(namespace: str) -> Mapping[str, Value]:
             if dds.is_local()
             else "anywhere"
         )
+        others += "" if namespace == "/" else f" in the namespace {namespace}"
         raise UpError(
             f"no sensor publishes in ROS domain {os.environ.get('ROS_DOMAIN_ID') or '0'} {others}: no skeletons, depth "
             "images or readings of inertial sensors. Play a recording with --bag BAG, name the sensors with "

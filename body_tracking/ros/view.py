@@ -105,7 +105,7 @@ def _graph(args: argparse.Namespace, choice: Any) -> argparse.Namespace:
     if choice.bag is not None and not names_sensors(options_from(args)):
         setup = dict(shipped_setup(choice.bag))
         if setup.pop("sensors", None) is not None:
-            chosen["sensors"] = graph.NO_SENSORS
+            chosen["sensors"] = [graph.NO_SENSORS]
         chosen |= setup
     if choice.filter != DEFAULT:
         chosen["filter"] = choice.filter

@@ -141,8 +141,16 @@ def test_a_wand_that_does_not_serve_is_refused_in_one_line(
     [
         (["target", "{bag}", "--name", "a", "--balls", "4"], "no frame with 4 points; 5 in 60 frames"),
         (["fit", "{bag}", "--joint", "elbow:knee:a:b"], "joint 'elbow:knee:a:b': expected NAME:KIND:PARENT:CHILD"),
+        (
+            ["fit", "{bag}", "--joint", "wrist:hinge:hand:hnad"],
+            "joint wrist: no target 'hnad' in {folder}/targets.yaml",
+        ),
         (["angles", "{bag}", "-o", "{folder}/out"], "chain.yaml: no such file; body_tracking markers fit makes it"),
         (["calibrate", "--camera", "left", "--columns", "9", "--rows", "6", "--square", "0.1"], "expected NAME=FOLDER"),
+        (
+            ["calibrate", "--camera", "left={folder}/x", "--columns", "9", "--rows", "6", "--square", "0.1"],
+            "camera left: no file in {folder}/x, or no such folder",
+        ),
     ],
 )
 def test_unusable_recordings_are_refused_in_one_line(
@@ -153,7 +161,7 @@ def test_unusable_recordings_are_refused_in_one_line(
     given = [word.format(bag=turned / "bag", folder=tmp_path) for word in words]
     assert cli.main(["markers", *given, "--setup", str(tmp_path)]) == 2
     out = capsys.readouterr()
-    assert said in out.err and out.err.count("\n") == 1
+    assert said.format(folder=tmp_path) in out.err and out.err.count("\n") == 1
     assert not (tmp_path / "out").exists()
 
 

@@ -331,6 +331,16 @@ def test_the_command_prints_a_report(t_pose: Path, tmp_path: Path, command: Comm
     assert 0.0 < report["elapsed_s"] < 60.0
 
 
+def test_a_recording_is_not_replaced_by_its_own_angles(tmp_path: Path, command: Command) -> None:
+    bag = tmp_path / "mine"
+    shutil.copytree(BAG, bag)
+    before = {each: each.read_bytes() for each in bag.iterdir()}
+    for given in (bag, next(bag.glob("*.mcap"))):
+        code, _, error = command("replay", given, "-o", bag, "--overwrite")
+        assert code == 2 and error == f"body_tracking: {bag}: is the recording itself; give another folder\n"
+        assert {each: each.read_bytes() for each in bag.iterdir()} == before
+
+
 def test_a_recording_without_skeletons_is_refused_with_the_options_for_it(tmp_path: Path, command: Command) -> None:
     code, _, error = command("replay", BAG.with_name("cameras_turning"), "-o", tmp_path / "out")
     assert code == 2 and "the option that takes them: --camera-rig FOLDER" in error
@@ -455,7 +465,7 @@ def test_calibrate_prints_poses_and_clocks(
         assert re.search(rf"^kinect2: at \(.*, {kind} residual \d+ mm$", said, re.MULTILINE)
     strict = tmp_path / "strict.yaml"
     strict.write_text("calibration:\n  ros__parameters:\n    max_rotation_stddev: 0.001\n")
-    assert "\ngood: kinect2 to 1." in out and " mm (good is below 2.9 degrees and 50 mm)" in out
+    assert "\ngood: kinect2 to 1." in out and " mm at the person's place (good is below 2.9 degrees and 50 mm)" in out
     said = command("calibrate", wave, "--params-file", strict)[1]
     assert "\nnot good enough: kinect2: roughly calibrated" in said and "(good is below 0.1 degrees and 50 mm)" in said
     assert "\nnext: record again, and walk about and turn where all sensors see you\n" in said

@@ -471,6 +471,13 @@ def test_what_only_the_metadata_says_of_a_bag_is_not_overwritten(tmp_path, chang
         assert metadata.read_text() == before
 
 
+def test_an_interrupted_writer_leaves_no_bag(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt), BagWriter(tmp_path / "bag") as writer:
+        writer.add_topic("/text", "std_msgs/msg/String")
+        raise KeyboardInterrupt
+    assert not list(tmp_path.iterdir())
+
+
 def test_two_writers_do_not_share_a_bag(tmp_path):
     with BagWriter(tmp_path / "bag"):
         with pytest.raises(BagError, match="another process"):
