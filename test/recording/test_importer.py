@@ -168,9 +168,15 @@ def test_import_and_info_as_json_and_for_people(tmp_path, capsys):
 
 def test_the_date_of_the_start_agrees_with_its_seconds(tmp_path, capsys):
     """Both are rounded: a recording of a simulation begins some nanoseconds before a whole second."""
-    run(capsys, "import", frames(tmp_path / "a.csv", 59.9997, 60.5), "-o", tmp_path / "bag")
+    run(capsys, "import", frames(tmp_path / "a.csv", 1750000019.9997, 1750000020.5), "-o", tmp_path / "bag")
     _, out, _ = run(capsys, "bag", "info", tmp_path / "bag")
-    assert "60.000 s (1970-01-01 00:01:00 UTC)" in out
+    assert "start     1750000020.000 s (2025-06-15 15:07:00 UTC)\n" in out
+
+
+def test_a_clock_that_began_at_zero_has_no_date(tmp_path, capsys):
+    run(capsys, "import", frames(tmp_path / "a.csv", 0.0, 0.5), "-o", tmp_path / "bag")
+    _, out, _ = run(capsys, "bag", "info", tmp_path / "bag")
+    assert "start     0.000 s\n" in out
 
 
 def test_a_truncated_recording_is_reported_and_closed(tmp_path, capsys):
