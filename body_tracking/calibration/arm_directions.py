@@ -57,7 +57,9 @@ class ArmLaw:
     def anatomical(self, measured: FloatArray) -> FloatArray:
         """Eq. (1): (..., 2, 3) unit directions of upper arm and forearm, right arm, axes of the thorax."""
         u, f = measured[..., 0, :], measured[..., 1, :]
-        return _unit(measured + np.stack([_rows(u) @ self.upper.T, _rows(u, f) @ self.forearm.T], axis=-2))
+        turned = measured + np.stack([_rows(u) @ self.upper.T, _rows(u, f) @ self.forearm.T], axis=-2)
+        result: FloatArray = turned / np.linalg.norm(turned, axis=-1, keepdims=True)
+        return result
 
     def measured(self, anatomical: FloatArray) -> FloatArray:
         """The inverse of :meth:`anatomical`, exact."""
@@ -127,9 +129,4 @@ def _solve(matrix: FloatArray, constant: FloatArray, end: FloatArray) -> FloatAr
     square, both = (p * p).sum(axis=-1), (p * q).sum(axis=-1)
     scale = (both + np.sqrt(both**2 + square * (1.0 - (q * q).sum(axis=-1)))) / square
     result: FloatArray = scale[..., None] * p - q
-    return result
-
-
-def _unit(vectors: FloatArray) -> FloatArray:
-    result: FloatArray = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
     return result

@@ -58,11 +58,7 @@ def save(result: CalibrationResult, path: Path) -> None:
     Raises:
         CalibrationError: the file cannot be written.
     """
-    text = _HEADER + files.dump_yaml(to_dict(result))
-    try:
-        files.write_text(path, text)
-    except files.FileError as error:
-        raise CalibrationError(f"{path}: {error}") from error
+    files.write_text(path, _HEADER + files.dump_yaml(to_dict(result)), CalibrationError)
 
 
 def _numbers(entry: dict[str, Any], key: str, count: int) -> np.ndarray:
@@ -115,10 +111,7 @@ def load(path: Path) -> CalibrationResult:
     Raises:
         CalibrationError: the file is missing, is not YAML, or lacks or misstates a value; the text names it.
     """
-    try:
-        data = files.read_yaml(path)
-    except files.FileError as error:
-        raise CalibrationError(f"{path}: {error}") from error
+    data = files.read_yaml(path, error=CalibrationError)
     if not isinstance(data, dict) or not isinstance(data.get("sensors"), dict) or "reference" not in data:
         raise CalibrationError(f"{path}: expected the keys reference and sensors")
     poses, clocks, quality = {}, {}, {}

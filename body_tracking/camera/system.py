@@ -45,11 +45,6 @@ def _topics(options: Options, camera: str) -> CameraTopics:
     return DRIVERS[str(options["driver"] or "plain")].of(camera)
 
 
-def _rig(options: Options) -> tuple[str, ...]:
-    """The sensor of a rig's triangulated skeletons; empty without a rig."""
-    return (RIG_SENSOR,) if options["camera_rig"] else ()
-
-
 def _finds(topics: Mapping[str, str]) -> dict[str, Value]:
     """Colour-and-depth cameras of one driver, unless other cameras publish skeletons."""
     if graph.sensors_among(topics):
@@ -151,7 +146,7 @@ SYSTEM = System(
     specs=_specs,
     played=_played,
     finds=lambda topics: _finds(topics) or _finds_compressed(topics),
-    computes=lambda options: (*_cameras(options), *_rig(options)),
+    computes=lambda options: (*_cameras(options), *((RIG_SENSOR,) if options["camera_rig"] else ())),
     filter="ekf",  # a camera states its errors, of which a linear filter knows no arm to 30 degrees (docs/accuracy.md)
     options=(
         Option(

@@ -86,19 +86,20 @@ def read_text(path: Path) -> str:
         raise FileError(f"cannot be read ({error})") from error
 
 
-def write_text(path: Path, text: str) -> None:
+def write_text(path: Path, text: str, error: type[BodyTrackingError] | None = None) -> None:
     """Write a text file, as a whole or not at all; its folder is made.
 
     Raises:
-        FileError: it cannot be written.
+        FileError: it cannot be written; or an ``error`` that names the file.
     """
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         partial.write_text(text, encoding="utf-8")
         partial.replace(path)
-    except OSError as error:
-        raise FileError(f"cannot be written ({error.strerror})") from error
+    except OSError as reason:
+        said = f"cannot be written ({reason.strerror})"
+        raise FileError(said) if error is None else error(f"{path}: {said}") from reason
 
 
 def check_new(path: Path, *, overwrite: bool) -> None:
@@ -154,13 +155,20 @@ def load_yaml(text: str, loader: Any = SafeLoader, *, aliases: bool = True) -> A
         raise FileError(f"is not YAML ({' '.join(str(error).split()) or type(error).__name__})") from error
 
 
-def read_yaml(path: Path, loader: Any = SafeLoader, *, aliases: bool = True) -> Any:
+def read_yaml(
+    path: Path, loader: Any = SafeLoader, *, aliases: bool = True, error: type[BodyTrackingError] | None = None
+) -> Any:
     """The content of a YAML file.
 
     Raises:
-        FileError: as :func:`read_text` and :func:`load_yaml`.
+        FileError: as :func:`read_text` and :func:`load_yaml`; or an ``error`` that names the file.
     """
-    return load_yaml(read_text(path), loader, aliases=aliases)
+    try:
+        return load_yaml(read_text(path), loader, aliases=aliases)
+    except FileError as reason:
+        if error is None:
+            raise
+        raise error(f"{path}: {reason}") from reason
 
 
 def _check(text: str, loader: Any, aliases: bool) -> None:

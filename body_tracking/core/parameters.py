@@ -220,10 +220,7 @@ def read_file(path: Path) -> dict[str, dict[str, object]]:
     Raises:
         ParameterError: no such file, not YAML, or not of the form ``node: {ros__parameters: {name: value}}``.
     """
-    try:
-        content = files.read_yaml(path, _Loader, aliases=False)  # rcl takes none
-    except files.FileError as error:
-        raise ParameterError(f"{path}: {error}") from error
+    content = files.read_yaml(path, _Loader, aliases=False, error=ParameterError)  # rcl takes no aliases
     sections: dict[str, dict[str, object]] = {}
     _collect(path, content if content is not None else {}, "", sections)
     return sections

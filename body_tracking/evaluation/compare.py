@@ -189,10 +189,7 @@ def read_systems(path: Path) -> dict[str, list[str]]:
     Raises:
         EvaluationError: it is unreadable or of another format.
     """
-    try:
-        content = files.read_yaml(path)
-    except files.FileError as error:
-        raise EvaluationError(f"{path}: {error}") from error
+    content = files.read_yaml(path, error=EvaluationError)
     if not isinstance(content, dict) or not content:
         raise EvaluationError(f"{path}: expected a mapping of the systems' names to arguments of replay")
     for name, arguments in content.items():

@@ -114,7 +114,8 @@ def read_segments(path: Path, topic: str | None = None, body: str | None = None)
                 f"{path}: holds neither {graph.MODEL_STATE} nor skeletons on {topic}; make some with replay"
             )
     rotations = model.forward(q, model.default_lengths()).rotations
-    name = None if angles is None else _convention_of(angles.names, model)
+    of_names = {convention(each, model).names: each for each in CONVENTIONS}
+    name = None if angles is None else of_names.get(angles.names)
     if angles is None or name is None:
         if computed is None:
             raise EvaluationError(f"{path}: holds {graph.MODEL_STATE}, but no joint angles; make them with replay")
@@ -148,10 +149,6 @@ def read_true_segments(path: Path) -> EstimatedSegments | None:
         *(path, graph.TRUE_MODEL_STATE, state.stamps_ns, rotations),
         *(replace(angles, stddev=np.zeros_like(angles.stddev)), "model", tuple(warnings)),
     )
-
-
-def _convention_of(names: tuple[str, ...], model: UpperBody) -> str | None:
-    return next((name for name in CONVENTIONS if convention(name, model).names == names), None)
 
 
 def joint_chains(name: str, mounted: frozenset[str], model: UpperBody) -> tuple[Chain, ...]:

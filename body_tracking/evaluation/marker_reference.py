@@ -216,10 +216,7 @@ def load_mountings(path: Path, segments: Mapping[str, str]) -> dict[str, Mountin
     Raises:
         EvaluationError: the file is unreadable, of another format, or has a target on another segment.
     """
-    try:
-        content = files.read_yaml(path)
-    except files.FileError as error:
-        raise EvaluationError(f"{path}: {error}") from error
+    content = files.read_yaml(path, error=EvaluationError)
     if not isinstance(content, dict):
         raise EvaluationError(f"{path}: no mapping of targets to mountings")
     found = {}

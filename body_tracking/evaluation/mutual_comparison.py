@@ -78,7 +78,8 @@ def compare_estimates(estimate: EstimatedSegments, reference: EstimatedSegments)
         raise EvaluationError(f"{both}: {seconds:.1f} s in common, {LEAST_OVERLAP:g} s are needed")
     stamps_ns = estimate.stamps_ns[inside]
     own = _at(estimate.angles, (stamps_ns - estimate.angles.stamps_ns[0]) / NANOSECONDS)
-    other = _at(reference.angles, at[inside] + _lead(reference))
+    lead = float(reference.stamps_ns[0] - reference.angles.stamps_ns[0]) / NANOSECONDS
+    other = _at(reference.angles, at[inside] + lead)
     shared = [name for name in estimate.angles.names if name in reference.angles.names]
     mine, theirs = ([series.names.index(name) for name in shared] for series in (estimate.angles, reference.angles))
     errors = wrapped(own.position[:, mine] - other.position[:, theirs])
@@ -112,11 +113,6 @@ def compare_estimates(estimate: EstimatedSegments, reference: EstimatedSegments)
         float(within[known].mean()),
         (*estimate.warnings, *reference.warnings, *notes, *notes_of(judged)),
     )
-
-
-def _lead(reference: EstimatedSegments) -> float:
-    """Seconds from the first stamp of the angles to that of the segments."""
-    return float(reference.stamps_ns[0] - reference.angles.stamps_ns[0]) / NANOSECONDS
 
 
 def _differences(

@@ -254,7 +254,12 @@ def vicon_decays(path: Path) -> list[Decay]:
     if not is_vicon_pendulum(path):
         raise PendulumError(f"{path}: the header is not that of Szczesna et al. (2016), {_HEADER!r}...")
     try:
-        rows = np.array([[_number(cell) for cell in line.split(";")] for line in [*CsvFile(path).lines()][2:]])
+        rows = np.array(
+            [  # some files have decimal commas
+                [float(cell.replace(",", ".") or "nan") for cell in line.split(";")]
+                for line in [*CsvFile(path).lines()][2:]
+            ]
+        )
     except ValueError as error:
         raise PendulumError(f"{path}: {error}") from error
     if rows.ndim != 2 or rows.shape[1] != _WIDTH:
@@ -279,11 +284,6 @@ def vicon_decays(path: Path) -> list[Decay]:
     if not found:
         raise PendulumError(f"{path}: the pendulum never swings out freely from {np.degrees(_LARGEST):.0f} degrees")
     return found
-
-
-def _number(cell: str) -> float:
-    """The number in a cell; some files have decimal commas."""
-    return float(cell.replace(",", ".") or "nan")
 
 
 def _decays(times: FloatArray, angle: FloatArray) -> list[tuple[int, int]]:

@@ -214,7 +214,8 @@ def _draw_person(figure: Any, tracked: Tracked, start_ns: int) -> None:
     chosen = [skeletons[n] for n in np.unique(np.linspace(0, len(skeletons) - 1, _INSTANTS).astype(int))]
     stamps, true = (np.array([each.stamp_ns for each in side], dtype=np.int64) for side in (chosen, truths))
     matches = nearest(true, stamps) if truths else np.full(len(chosen), -1)
-    axes, heading = figure.subplots(1, len(chosen), sharex=True, sharey=True, squeeze=False)[0], _heading(chosen)
+    axes = figure.subplots(1, len(chosen), sharex=True, sharey=True, squeeze=False)[0]
+    heading = float(np.angle(_left(chosen).sum()))
     view = _view(heading)
     pairs = [(skeleton, truths[match]) for skeleton, match in zip(chosen, matches, strict=True) if match >= 0]
     true_view = _view(heading + _turn(pairs))
@@ -251,11 +252,6 @@ def _left(skeletons: Iterable[Skeleton]) -> npt.NDArray[np.complex128]:
     across = np.nan_to_num(across.reshape(-1, 3))
     left: npt.NDArray[np.complex128] = across[:, 0] + 1j * across[:, 1]
     return left
-
-
-def _heading(skeletons: list[Skeleton]) -> float:
-    """Mean direction of the person's left, radians from the world's x axis."""
-    return float(np.angle(_left(skeletons).sum()))
 
 
 def _turn(pairs: list[tuple[Skeleton, Skeleton]]) -> float:

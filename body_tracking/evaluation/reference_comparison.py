@@ -134,7 +134,11 @@ def evaluate_by_markers(
         for number, half in enumerate(halves)
     ]
     orientations = [
-        judge(_pair(child, parent), [each.orientation(parent, child) for each in compared], mountings_known=bool(known))
+        judge(
+            f"{child} in {parent or _WORLD}",
+            [each.orientation(parent, child) for each in compared],
+            mountings_known=bool(known),
+        )
         for child, parent in _pairs(reference.segments.values())
     ]
     angles, curves = _angles(estimate, reference, compared, bool(known))
@@ -184,10 +188,6 @@ def _start_clock(
 
 
 # --- differences
-
-
-def _pair(child: str, parent: str | None) -> str:
-    return f"{child} in {parent or _WORLD}"
 
 
 def _pairs(mounted: Iterable[str]) -> list[tuple[str, str | None]]:

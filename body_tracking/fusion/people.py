@@ -160,7 +160,9 @@ class People(PlacedSensors[_Sensor]):
             turned = pose.rotation @ source.used.rotation.T
             self._association.move_sensor(sensor, turned, pose.translation - turned @ source.used.translation)
         source.used = pose
-        whose = self._association.assign(sensor, [_in_world(body, stamp_ns, pose) for body in seen])
+        whose = self._association.assign(
+            sensor, [replace(body, stamp_ns=stamp_ns, positions=_points(body, pose)) for body in seen]
+        )
         self._choose(stamp_ns)
         numbers = (None if person is None else self._number(person) for person in whose)
         found = [(number, body) for number, body in zip(numbers, seen, strict=True) if number is not None]
@@ -228,7 +230,3 @@ class People(PlacedSensors[_Sensor]):
 def _points(skeleton: Skeleton, pose: SensorPose) -> FloatArray:
     """(25, 3) metres in world; NaN for joints that are not valid."""
     return pose.apply(np.where(skeleton.valid[:, None], skeleton.positions, np.nan))
-
-
-def _in_world(skeleton: Skeleton, stamp_ns: int, pose: SensorPose) -> Skeleton:
-    return replace(skeleton, stamp_ns=stamp_ns, positions=_points(skeleton, pose))

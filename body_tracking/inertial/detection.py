@@ -132,13 +132,13 @@ def likelihood_by_pose(
         tables.append(-0.5 * (off**2).sum(axis=-1) / variance - 1.5 * np.log(variance))
     # the prior keeps the stated assignment where another fits as well at another heading: two forearms in a T-pose,
     # exchanged, fit half a turn away
-    best = max(tables, key=lambda table: _value(table + SURE * np.eye(len(segments))))
+
+    def value(table: FloatArray) -> float:
+        likely = table + SURE * np.eye(len(segments))
+        return float(likely[linear_sum_assignment(likely, maximize=True)].sum())
+
+    best = max(tables, key=value)
     return np.asarray(best)
-
-
-def _value(table: FloatArray) -> float:
-    """The sum over the best assignment."""
-    return float(table[linear_sum_assignment(table, maximize=True)].sum())
 
 
 class SlipDetector:

@@ -112,8 +112,8 @@ class ImuStage(Stage):
         return ()
 
     def _read(self, segment: str, sample: ImuSample, received_ns: int) -> Iterable[Output]:
-        field = self._field_at(segment, sample.stamp_ns)
-        if field is not None:
+        stamp_ns, field = self._fields.pop(segment, (0, None))  # the latest, once
+        if field is not None and abs(sample.stamp_ns - stamp_ns) < _FIELD_NS:
             sample = replace(sample, magnetic_field=field)
         try:
             output = self.tracker.add(segment, sample, received_ns, skeleton=self.wanted(graph.IMU_SKELETON))
@@ -128,11 +128,6 @@ class ImuStage(Stage):
         if output.skeleton is not None:
             outputs.append(Output(graph.IMU_SKELETON, (output.skeleton,), output.skeleton.stamp_ns))
         return outputs
-
-    def _field_at(self, segment: str, at_ns: int) -> FloatArray | None:
-        """The latest field, once, if its stamp is near the reading's."""
-        stamp_ns, vector = self._fields.pop(segment, (0, None))
-        return vector if vector is not None and abs(at_ns - stamp_ns) < _FIELD_NS else None
 
     def refused(self, topic: str) -> None:
         """Count an invalid message of a sensor."""

@@ -650,7 +650,7 @@ class InertialTracker:
             stamp_ns,
             f"imu_{sensor.segment}",
             sensor.segment,
-            _orthonormal(world),
+            so3.quat_to_matrix(so3.matrix_to_quat(world)),  # without accumulated rounding errors
             covariance,
             rate if reading.rate_measured else None,
             rate_variance(rate),
@@ -681,8 +681,3 @@ class InertialTracker:
 def rate_variance(rate: FloatArray) -> float:
     """rad2/s2 per axis: variance of a segment's rate (3,) as measured by its sensor."""
     return float((_RATE_STDDEV + _RATE_SHARE * np.linalg.norm(rate)) ** 2)
-
-
-def _orthonormal(rotation: FloatArray) -> FloatArray:
-    """A product of many rotations without its accumulated rounding errors."""
-    return so3.quat_to_matrix(so3.matrix_to_quat(rotation))

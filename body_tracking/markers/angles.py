@@ -224,13 +224,10 @@ class AngleEstimator:
 
     def _near(self) -> FloatArray | None:
         """(b, 3) last angles of all ball joints; None before the first frame."""
-        near = np.stack([self._previous[self._rows(index)] for index in self._balls])
+        starts = [self._tree.slices[index].start - ROOT for index in self._balls]
+        near = np.stack([self._previous[start : start + 3] for start in starts])
         unknown = np.isnan(near)
         return None if unknown.all() else np.where(unknown, 0.0, near)
-
-    def _rows(self, index: int) -> slice:
-        where = self._tree.slices[index]
-        return slice(where.start - ROOT, where.stop - ROOT)
 
     def _turns(self, posture: Posture, covariance: FloatArray, known: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Turns (j, 3, 3) and their covariance, NaN where unknown."""

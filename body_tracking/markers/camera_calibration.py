@@ -224,7 +224,7 @@ def _single_camera(
             view: _Seen(rows, np.asarray(_CV.Rodrigues(turn)[0]), np.asarray(shift).ravel())
             for (view, rows), turn, shift in zip(boards.items(), turns, shifts, strict=True)
         }
-        errors = np.array([_rms(_missed(camera, each, each, corners)) for each in found.values()])
+        errors = np.sqrt([(_missed(camera, each, each, corners) ** 2).mean() for each in found.values()])
         wrong = _too_large(errors, _SINGLE) & (errors == errors.max())
         if not wrong.any():
             return camera, found
@@ -255,10 +255,6 @@ def _missed(camera: Camera, pose: _Seen, board: _Seen, corners: Corners) -> Floa
     points = corners.board[board.rows] @ pose.rotation.T + pose.translation
     missed: FloatArray = np.linalg.norm(camera.project(points) - corners.pixels[board.rows], axis=-1)
     return np.where(np.isfinite(missed), missed, np.inf)
-
-
-def _rms(distances: FloatArray) -> float:
-    return float(np.sqrt((distances**2).mean()))
 
 
 def _camera_poses(

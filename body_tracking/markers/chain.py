@@ -139,7 +139,8 @@ def fit_chain(
     if shared is not None:
         known = shared.shape[-1]
     if shapes is not None:
-        own = _own(poses, shapes)
+        # each target has columns of its own
+        own = np.concatenate([_shared(poses, shapes, column) for column in range(len(poses.targets))], axis=-1)
         shared = own if shared is None else np.concatenate([shared, own], axis=-1)
     rows: BoolArray = np.asarray(poses.seen.any(axis=1))
     poses, shared = poses.rows(rows), None if shared is None else shared[rows]
@@ -154,12 +155,6 @@ def fit_chain(
     return ChainFit(
         Chain(found.tree.joints, covariance, found.sensitivity[:, :known], found.scale), fits, tuple(warnings)
     )
-
-
-def _own(poses: PoseTable, shapes: Sequence[Mapping[str, FloatArray]]) -> FloatArray:
-    """(n, m, 6, s) effects of the geometry errors of all targets; each target has columns of its own."""
-    parts = [_shared(poses, shapes, column) for column in range(len(poses.targets))]
-    return np.concatenate(parts, axis=-1)
 
 
 def _shared(poses: PoseTable, sensitivities: Sequence[Mapping[str, FloatArray]], only: int | None = None) -> FloatArray:

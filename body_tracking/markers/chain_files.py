@@ -54,10 +54,7 @@ def save_chain(chain: Chain, path: Path) -> None:
         "covariance": [row[: index + 1].tolist() for index, row in enumerate(chain.covariance)],
     }
     text = _HEADER + files.dump_yaml(content, default_flow_style=None, width=120)
-    try:
-        files.write_text(path, text)
-    except files.FileError as error:
-        raise ChainFileError(f"{path}: {error}") from error
+    files.write_text(path, text, ChainFileError)
 
 
 def load_chain(path: Path) -> Chain:
@@ -66,10 +63,7 @@ def load_chain(path: Path) -> Chain:
     Raises:
         ChainFileError: the file is missing, is not YAML, or lacks or misstates a value; the message names the value.
     """
-    try:
-        data = files.read_yaml(path, aliases=False)
-    except files.FileError as error:
-        raise ChainFileError(f"{path}: {error}") from error
+    data = files.read_yaml(path, aliases=False, error=ChainFileError)
     if not isinstance(data, dict) or not isinstance(data.get("joints"), list):
         raise ChainFileError(f"{path}: expected the keys scale, joints, covariance and sensitivity")
     try:

@@ -248,17 +248,13 @@ def _rivals(
     """Whether another candidate, at this extra cost, makes the target uncertain."""
     if other is None:
         return more < MARGIN
-    if other is own or _same(own, other):
+    apart = np.abs(own.balls - other.balls).max()
+    if other is own or apart <= _SAME * (own.balls.max(axis=0) - own.balls.min(axis=0)).max():
         return False
         # candidates of shared points compare by likelihood; a candidate of other points needs an explanation of its own
     shared = len(set(own.assignment) & set(other.assignment) - {-1})
     fewer = other.assignment.count(-1) > own.assignment.count(-1)
     return more < MARGIN or (shared < FEWEST and not fewer and believed(name, other))
-
-
-def _same(first: Candidate, second: Candidate) -> bool:
-    apart = np.abs(first.balls - second.balls).max()
-    return bool(apart <= _SAME * (first.balls.max(axis=0) - first.balls.min(axis=0)).max())
 
 
 def _competing(candidates: dict[str, list[Candidate]]) -> list[list[str]]:

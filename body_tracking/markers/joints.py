@@ -113,7 +113,8 @@ def fit_joint(name: str, kind: JointKind, poses: PoseTable, parent: str, child: 
     problems = [*_motion_problems(kind, motion), *_rigidity_problems(pair)]
     if Verdict.ONE_AXIS in [problem for problem, _ in problems]:
         joint = _nearest_on_line(joint)
-    gap, turn = _gap(joint, rotations, translations), _turn(joint, rotations)
+    apart = joint.parent_centre - rotations @ joint.child_centre - translations
+    gap, turn = float(np.sqrt((apart**2).sum(axis=-1).mean())), _turn(joint, rotations)
     problems += _misfit_problems(joint, found.scale, gap, turn)
     verdict = max((problem for problem, _ in problems), key=_WORST.index, default=Verdict.GOOD)
     warnings = tuple(f"{name}: {text}" for _, text in problems)
@@ -166,11 +167,6 @@ def _misfit_problems(joint: Joint, scale: float, gap: float, turn: float) -> lis
         f"tissue, a joint that is no {joint.kind.value} joint, or noise that is stated too small"
     )
     return [(Verdict.NOT_OF_KIND if scale >= MISFIT else Verdict.GOOD, text)]
-
-
-def _gap(joint: Joint, rotations: FloatArray, translations: FloatArray) -> float:
-    apart = joint.parent_centre - rotations @ joint.child_centre - translations
-    return float(np.sqrt((apart**2).sum(axis=-1).mean()))
 
 
 def _turn(joint: Joint, rotations: FloatArray) -> float:

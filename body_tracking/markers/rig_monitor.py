@@ -163,7 +163,8 @@ class RigMonitor:
             if last is not None:
                 velocities[rays.first[index] : rays.first[index + 1]] = _velocities(last, image)
             self._last[image.camera] = image
-        pixels = np.concatenate([np.zeros((0, 2)), *(b.pixels for b in self._in_order(balls))])
+        in_order = sorted(balls, key=lambda image: self._geometry.index[image.camera])
+        pixels = np.concatenate([np.zeros((0, 2)), *(image.pixels for image in in_order)])
         count = len(self._rig.cameras)
         for a in range(count):
             for b in range(a + 1, count):
@@ -251,9 +252,6 @@ class RigMonitor:
             return None  # not sure yet
         amount = best.size if fault is Fault.MOVED_CAMERA else float(best.cause[0])
         return Finding(fault, (frame, *(rival[2] for rival in rivals)), amount, best.deviation)
-
-    def _in_order(self, balls: Sequence[ImageBalls]) -> list[ImageBalls]:
-        return sorted(balls, key=lambda image: self._geometry.index[image.camera])
 
     def _pairs_in_reach(self, rays: Rays, velocities: FloatArray, a: int, b: int) -> tuple[IntArray, IntArray]:
         """Balls of two cameras within reach of each other's epipolar lines; balls with many partners are excluded."""

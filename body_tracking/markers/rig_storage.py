@@ -62,10 +62,7 @@ def save_rig(rig: Rig, path: Path) -> None:
         ],
         "covariance": rig.covariance[np.tril_indices(rig.size)].tolist(),
     }
-    try:
-        files.write_text(path, _HEADER + files.dump_yaml(content, width=120))
-    except files.FileError as error:
-        raise RigFileError(f"{path}: {error}") from error
+    files.write_text(path, _HEADER + files.dump_yaml(content, width=120), RigFileError)
 
 
 def load_rig(path: Path) -> Rig:
@@ -74,10 +71,7 @@ def load_rig(path: Path) -> Rig:
     Raises:
         RigFileError: the file cannot be read or holds no valid rig; the message names the problem.
     """
-    try:
-        content = files.read_yaml(path, aliases=False)
-    except files.FileError as error:
-        raise RigFileError(f"{path}: {error}") from error
+    content = files.read_yaml(path, aliases=False, error=RigFileError)
     try:
         entries = content["cameras"]
         if not isinstance(entries, list) or not 1 <= len(entries) <= MAX_CAMERAS:

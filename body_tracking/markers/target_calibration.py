@@ -94,7 +94,8 @@ def calibrate_target(
     for _ in range(_ITERATIONS):
         costs[enough] = _costs(shape, views[enough], seen[enough], weights[enough])
         # scaled by the median cost, so that a slightly flexible target or underestimated noise makes no outliers
-        unit: float = _robust_unit(costs[enough], degrees[enough])
+        medians = np.array([chi_square.gate(int(degree), 0.5) for degree in degrees[enough]])
+        unit = float(np.median(costs[enough] / medians))
         unit = unit if covariance is None else max(unit, 1.0)
         fits = enough & (costs <= (_BENT**2 if flexible else 1.0) * unit * gates)
         if np.array_equal(fits, used):
@@ -229,8 +230,10 @@ def _start(name: str, views: FloatArray, seen: BoolArray, enough: BoolArray) -> 
         raise TargetCalibrationError(
             f"target {name}: ball {int(np.flatnonzero(~known)[0])} of {balls} is never seen with three of the others"
         )
-    _check_spread(name, shape - shape.mean(axis=0))
     centred: FloatArray = shape - shape.mean(axis=0)
+    widths = np.linalg.svd(centred, compute_uv=False)
+    if not widths[1] > 1e-3 * widths[0]:
+        raise TargetCalibrationError(f"target {name}: the balls lie on one line")
     return centred
 
 
@@ -320,12 +323,6 @@ def _costs(shape: FloatArray, views: FloatArray, seen: BoolArray, weights: Float
     return costs
 
 
-def _robust_unit(costs: FloatArray, degrees: IntArray) -> float:
-    """The variance of a coordinate, from the median of the views' costs."""
-    medians = np.array([chi_square.gate(int(degree), 0.5) for degree in degrees])
-    return float(np.median(costs / medians))
-
-
 def _flexibility(residuals: FloatArray, seen: BoolArray, covariance: FloatArray | None) -> FloatArray:
     """(k,) variance of a coordinate of each ball beyond its noise.
 
@@ -356,9 +353,3 @@ def _axes(name: str, shape: FloatArray) -> FloatArray:
     third = int(wide[0]) if len(wide) else int(widths.argmax())
     y = across[third] / widths[third]
     return np.stack([x, y, np.cross(x, y)])
-
-
-def _check_spread(name: str, points: FloatArray) -> None:
-    widths = np.linalg.svd(points, compute_uv=False)
-    if not widths[1] > 1e-3 * widths[0]:
-        raise TargetCalibrationError(f"target {name}: the balls lie on one line")

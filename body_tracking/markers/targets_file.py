@@ -43,10 +43,7 @@ def save_targets(targets: Sequence[Target], path: Path) -> None:
         entries[target.name] = {"points": target.points.tolist(), "diameter": float(target.diameter)}
         if target.covariance.any():
             entries[target.name]["covariance"] = target.covariance.tolist()
-    try:
-        files.write_text(path, _HEADER + files.dump_yaml({"targets": entries}))
-    except files.FileError as error:
-        raise TargetsFileError(f"{path}: {error}") from error
+    files.write_text(path, _HEADER + files.dump_yaml({"targets": entries}), TargetsFileError)
 
 
 def load_targets(path: Path) -> list[Target]:
@@ -55,10 +52,7 @@ def load_targets(path: Path) -> list[Target]:
     Raises:
         TargetsFileError: the file is missing, is not YAML, or lacks or misstates a value; the message names the value.
     """
-    try:
-        data = files.read_yaml(path)
-    except files.FileError as error:
-        raise TargetsFileError(f"{path}: {error}") from error
+    data = files.read_yaml(path, error=TargetsFileError)
     entries = data.get("targets") if isinstance(data, dict) else None
     if not isinstance(entries, dict):
         raise TargetsFileError(f"{path}: expected the key targets")

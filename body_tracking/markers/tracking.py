@@ -11,7 +11,7 @@ import numpy as np
 
 from body_tracking.core import chi_square
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray
+from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray
 from body_tracking.markers.interpretation import MAX_CHANCE, Candidate, decide, expected_by_chance, fitted_together
 from body_tracking.markers.observations import Points, TargetPose
 from body_tracking.markers.pose import FEWEST
@@ -212,7 +212,7 @@ class TargetTracker:
             points, positions=points.positions[rows], covariance=points.covariance[rows], balls=points.balls[rows]
         )
         result = self._recogniser.recognise(left, until.remaining(), lost)
-        poses = tuple(replace(pose, points=_renumbered(pose.points, rows)) for pose in result.poses)
+        poses = tuple(replace(pose, points=np.where(pose.points >= 0, rows[pose.points], -1)) for pose in result.poses)
         for pose in poses:
             self._tracks[pose.name] = Track.begun(pose, self._motion)
         self.counters.given_up += not result.complete
@@ -239,8 +239,3 @@ def _believed(target: Target, points: Points, candidate: Candidate, track: Track
     prior = track.covariance[:6, :6]
     poses = math.pi**3 / 6.0 * _INNOVATION_GATE**3 * math.sqrt(max(np.linalg.det(prior + candidate.covariance), 0.0))
     return expected_by_chance(target, points, candidate, poses) < MAX_CHANCE
-
-
-def _renumbered(points: IntArray, rows: IntArray) -> IntArray:
-    result: IntArray = np.where(points >= 0, rows[points], -1)
-    return result

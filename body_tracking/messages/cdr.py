@@ -112,7 +112,9 @@ def encode_skeletons(skeletons: tuple[Skeleton, ...] | list[Skeleton]) -> bytes:
         if skeleton.velocities is not None:
             row[:, -3:] = skeleton.velocities
     dense = b"\x01" if all(np.isfinite(each.positions).all() for each in skeletons) else b"\x00"
-    return _header(first.stamp_ns, first.frame_id) + layout.table + points.tobytes() + dense
+    stamp = struct.pack("<iI", *divmod(first.stamp_ns, NANOSECONDS))
+    header = _ENCAPSULATION + stamp + _padded(_string(first.frame_id))
+    return header + layout.table + points.tobytes() + dense
 
 
 def decode_skeletons(cdr: bytes) -> tuple[Skeleton, ...] | None:
@@ -156,11 +158,6 @@ def stamp_of(cdr: bytes) -> int:
         return 0
     seconds, nanoseconds = struct.unpack_from("<iI" if cdr[1] & 1 else ">iI", cdr, 4)
     return int(seconds) * NANOSECONDS + int(nanoseconds)
-
-
-def _header(stamp_ns: int, frame_id: str) -> bytes:
-    """Encapsulation and ``std_msgs/Header``, padded to 4."""
-    return _ENCAPSULATION + struct.pack("<iI", *divmod(stamp_ns, NANOSECONDS)) + _padded(_string(frame_id))
 
 
 _KINDS = ((True, False), (True, True), (False, False))

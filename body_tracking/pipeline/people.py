@@ -82,7 +82,8 @@ class SubjectSelector:
         if subject is None and seen:
             if self.body is not None and 0 <= seen[0].stamp_ns - self._seen_ns < self._hold_ns:
                 return None
-            subject = min(seen, key=_distance)
+            # the nearest by the mean of the joints, from the frame's origin
+            subject = min(seen, key=lambda each: float(np.linalg.norm(each.positions[each.valid].mean(axis=0))))
         if subject is not None:
             self.body, self._seen_ns = subject.body, subject.stamp_ns
         return subject
@@ -90,8 +91,3 @@ class SubjectSelector:
     def reset(self) -> None:
         """Forget the picked body."""
         self.body = None
-
-
-def _distance(skeleton: Skeleton) -> float:
-    """Metres from the frame's origin to the mean of the joints."""
-    return float(np.linalg.norm(skeleton.positions[skeleton.valid].mean(axis=0)))

@@ -143,7 +143,9 @@ def bags_in(folder: Path) -> tuple[Path, ...]:
 def shipped_bags() -> tuple[Path, ...]:
     """The recordings of the repository or of the installed package."""
     found = _shipped()
-    return () if found is None else tuple(sorted(filter(is_bag, (found / "bags").iterdir()), key=_rank))
+    bags = [] if found is None else filter(is_bag, (found / "bags").iterdir())
+    # those of skeletons first, which need no options
+    return tuple(sorted(bags, key=lambda bag: (not bag.name.startswith("tpose"), bag.name)))
 
 
 def shipped_setup(bag: Path) -> Mapping[str, Value]:
@@ -160,8 +162,3 @@ def _shipped() -> Path | None:
     beside = Path(body_tracking.__file__).parents[1]
     places = (beside, *(each / "share" / "body_tracking" for each in (Path(sys.prefix), *beside.parents)))
     return next((place for place in places if (place / "bags").is_dir()), None)
-
-
-def _rank(bag: Path) -> tuple[bool, str]:
-    """Sort key: recordings of skeletons first, which need no options."""
-    return not bag.name.startswith("tpose"), bag.name

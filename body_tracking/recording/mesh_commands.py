@@ -110,7 +110,11 @@ def pictures(recording: Path, camera: str, count: int) -> list[NDArray[np.uint8]
     for stamp_ns in (both[number] for number in chosen):
         depth, corners = DepthImage().decode(images[stamp_ns], BAG_WIRE)[2], meshes[stamp_ns]
         box = _box(info.project(corners.reshape(-1, 3)), info)
-        column = [_enlarged(overlay(depth, each, info)[box]) for each in (corners[:0], corners)]
+        size = _SIDE, _SIDE
+        column = [
+            np.asarray(cv2.resize(overlay(depth, each, info)[box], size, interpolation=cv2.INTER_NEAREST), np.uint8)
+            for each in (corners[:0], corners)
+        ]
         text = f"{(stamp_ns - both[0]) / NANOSECONDS:.1f} s"
         column[0][-40:, :100] = 0  # readable on any ground
         cv2.putText(column[0], text, (8, _SIDE - 10), cv2.FONT_HERSHEY_SIMPLEX, 0.9, (255, 255, 255), 2, cv2.LINE_AA)
@@ -124,10 +128,6 @@ def _box(pixels: FloatArray, camera: Camera) -> tuple[slice, slice]:
     side = int(min(1.15 * float((high - low).max()) + 4.0, camera.width, camera.height))
     left, top = np.clip(0.5 * (low + high - side), 0, [camera.width - side, camera.height - side]).astype(int).tolist()
     return slice(top, top + side), slice(left, left + side)
-
-
-def _enlarged(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    return np.asarray(cv2.resize(image, (_SIDE, _SIDE), interpolation=cv2.INTER_NEAREST), np.uint8)
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -88,7 +88,9 @@ class RecordingSource:
             now_ns = time.time_ns()
             if now_ns - due_ns > LATE_NS:
                 self._counters["left out, late"] += 1
-                self._skip_rounds(now_ns - due_ns)
+                if self._rounds_ns and self._zero_ns is not None:  # skip whole loops at once: their length is known
+                    length = self._last_ns - self._zero_ns + LOOP_GAP_NS
+                    self._rounds_ns += int((now_ns - due_ns) * self._settings.rate) // length * length
                 self._next = self._advance()
                 continue
             self._closed.wait(max(0, min(due_ns, deadline_ns) - now_ns) / NANOSECONDS)
@@ -114,12 +116,6 @@ class RecordingSource:
         stamp_ns = self._wall_ns(stamp_ns)
         skeletons = [replace(each, stamp_ns=stamp_ns, frame_id=optical_frame(name)) for each in frame.skeletons]
         return RecordedFrame(name, self._wall_ns(frame.received_ns), tuple(skeletons))
-
-    def _skip_rounds(self, late_ns: int) -> None:
-        """Skip whole loops at once, after the first one has shown their length."""
-        if self._rounds_ns and self._zero_ns is not None:
-            length = self._last_ns - self._zero_ns + LOOP_GAP_NS
-            self._rounds_ns += int(late_ns * self._settings.rate) // length * length
 
     def _advance(self) -> RecordedFrame | None:
         """The next frame of the wanted sensor."""

@@ -108,7 +108,7 @@ class ClothedPerson:
         body, found = self.body, dict[str, FloatArray]()
         for bone, (first, second, share) in _TRUNK.items():
             one, other = segments[_SEGMENT[first]], segments[_SEGMENT[second]]
-            found[bone] = one @ _part(one.T @ other, share)
+            found[bone] = one @ so3.quat_to_matrix(so3.exp(share * so3.rotation_vectors(one.T @ other)))
         for side, suffix, number in _SIDES:
             clavicle, upper, fore, hand = (
                 segments[_SEGMENT[f"{name}_{side}"]] for name in ("clavicle", "upper_arm", "forearm", "hand")
@@ -153,12 +153,6 @@ def _kinect_joints(body: Body, heads: FloatArray, head: FloatArray) -> FloatArra
         for name, bone in (*_ARM_JOINTS, *_LEG_JOINTS, *_HAND_JOINTS):
             found[Joint[f"{name}_{side.upper()}"]] = place[f"{bone}.{suffix}"]
     return found
-
-
-def _part(rotation: FloatArray, share: float) -> FloatArray:
-    """(3, 3) the rotation by a share of a rotation's angle."""
-    vector = so3.log(so3.matrix_to_quat(rotation))
-    return so3.quat_to_matrix(so3.exp(share * vector))
 
 
 def _untwisted(relative: FloatArray) -> FloatArray:

@@ -111,7 +111,8 @@ class DepthScene:
         count = int(min(self.movement.duration / self.speed, np.inf if stop is None else stop) * RATE)
         numbers = np.arange(round(start * RATE), count, step)
         course = self.course(numbers / RATE)
-        view, floor, room = DepthCamera(self.camera), self._floor(), render(*self.room(), self.camera).depth
+        floor = Floor(self.pose.rotation.T @ [0.0, 0.0, 1.0], _HEIGHT)
+        view, room = DepthCamera(self.camera), render(*self.room(), self.camera).depth
         empty = measured(room, view, self._rng(-1), self.errors, floor=floor)
         rotation, translation = self.pose.rotation, self.pose.translation
         for index, number in enumerate(numbers.tolist()):
@@ -130,9 +131,6 @@ class DepthScene:
 
     def _rng(self, number: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, self._name, 7, number + 1])
-
-    def _floor(self) -> Floor:
-        return Floor(self.pose.rotation.T @ [0.0, 0.0, 1.0], _HEIGHT)
 
     def room(self) -> tuple[FloatArray, NDArray[np.int32]]:
         """Vertices (n, 3) of floor, wall and table in the optical frame, metres, and faces (m, 3), the floor's first.

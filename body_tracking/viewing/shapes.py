@@ -162,7 +162,7 @@ def figure(skeletons: Sequence[Skeleton], own: Colour) -> Figure:
     joints, colours, bones = [np.empty((0, 3))], [np.empty((0, 3), np.uint8)], [np.empty((0, 2, 3))]
     which: list[IntArray] = [np.empty((0, 2), np.intp)]
     for place, skeleton in enumerate(skeletons):
-        placed = _placed(skeleton)
+        placed = np.all(np.abs(skeleton.positions) < MAX_RANGE, axis=1)
         joints.append(skeleton.positions[placed])
         numbers = np.flatnonzero(placed)
         which.append(np.stack([np.full_like(numbers, place), numbers], axis=1))
@@ -186,12 +186,6 @@ def capsules(skeletons: Sequence[Skeleton]) -> Capsules:
         ends.append(bones)
         radii.append(BONE_RADII[there])
     return Capsules(np.concatenate(ends), np.concatenate(radii))
-
-
-def _placed(skeleton: Skeleton) -> BoolArray:
-    """(25,) which joints have a position, in any tracking state."""
-    placed: BoolArray = np.all(np.abs(skeleton.positions) < MAX_RANGE, axis=1)
-    return placed
 
 
 def _bones(skeleton: Skeleton, known: BoolArray) -> tuple[FloatArray, BoolArray]:
