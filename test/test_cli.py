@@ -52,7 +52,7 @@ def test_without_a_command_it_says_what_to_do_next(nobody: Path, capsys: pytest.
     assert "Recordings in this folder: bags/mine." in text
     assert "  body_tracking up --bag bags/mine" in text and "  body_tracking replay bags/mine -o mine_angles" in text
     with BagWriter(nobody / "session") as writer:
-        writer.add_topic("/humans/bodies/body1/joint_states", JOINT_STATE)
+        writer.add_topic("/lab/humans/bodies/body1/joint_states", JOINT_STATE)  # of a graph in a namespace
     assert "Recordings in this folder: session, bags/mine." in (text := said())
     assert "  body_tracking show session\n  body_tracking up --bag session" in text and "replay" not in text
     (nobody / "lab.yaml").write_text("kinect1_skeleton: {ros__parameters: {backend: network}}")

@@ -86,7 +86,7 @@ class DetectorStage(Stage):
         detection.prepare()
         waiting = _KEPT if values["reliable"] else 0
         self.inputs = tuple(
-            Port(topic, CameraImage(), _IMAGES, waiting, perishable=not waiting) for topic in self._topics
+            Port(topic, CameraImage(), _IMAGES, waiting, perishable=not waiting, foreign=True) for topic in self._topics
         )
         self.outputs = tuple(Port(topic, Balls(), RELIABLE, measured=True) for topic in self._topics.values())
 

@@ -95,10 +95,10 @@ def _recordings(folder: Path, page: str, *, live: bool) -> Iterator[Step]:
 
 def _holds_angles(bag: Path) -> bool:
     from body_tracking.pipeline.graph import bodies_among
-    from body_tracking.recording.rosbag2 import BagReader
+    from body_tracking.recording.rig import RigReader
 
     try:
-        with BagReader(bag) as reader:
+        with RigReader(bag) as reader:
             return bool(bodies_among(reader.topics))
     except BodyTrackingError:
         return False

@@ -214,5 +214,7 @@ def run(args: argparse.Namespace) -> int:
         if finding.remedy:
             print(f"      -> {finding.remedy}")
     verdict = "solve the problems first" if counts[PROBLEM] else "nothing here prevents tracking"
+    if counts[WARNING] and not counts[PROBLEM]:
+        verdict = "if no angles arrive, see the warnings"
     print(f"\nproblems: {counts[PROBLEM]}, warnings: {counts[WARNING]}, OK: {counts[OK]}: {verdict}")
     return 1 if counts[PROBLEM] else 0

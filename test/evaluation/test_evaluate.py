@@ -20,7 +20,7 @@ from body_tracking.core.skeleton import JOINT_NAMES, N_JOINTS, Skeleton, Trackin
 from body_tracking.evaluation.comparison import Evaluation, evaluate
 from body_tracking.evaluation.metrics import Curve
 from body_tracking.evaluation.reading import read_estimate, read_markers, read_truth
-from body_tracking.evaluation.report import report_of, tables
+from body_tracking.evaluation.report import Column, report_of, tables
 from body_tracking.messages.skeletons import skeletons_to_cloud
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagWriter
 
@@ -50,6 +50,11 @@ def bag_of(folder: Path, skeletons: int, topic: str = "/filtered/skeleton", kind
             skeleton = Skeleton(10**9 + number, "world", np.ones((N_JOINTS, 3)), states)
             bag.write_message(topic, skeletons_to_cloud((skeleton,), BAG_MESSAGES), number)
     return folder
+
+
+@pytest.mark.parametrize(("value", "text"), [(-0.04, "0.0"), (-0.06, "-0.1"), (np.nan, "-"), (np.inf, "inf")])
+def test_numbers_of_a_table(value: float, text: str) -> None:
+    assert Column("bias", "bias", "deg", np.array([value])).text(0) == text
 
 
 def test_the_table_holds_the_results(reported: tuple[str, str], result: Evaluation) -> None:

@@ -40,10 +40,23 @@ def test_images_become_skeletons_and_angles_with_deviations(tmp_path: Path) -> N
     assert counts[topics[1]] == counts[topics[2]] >= 25
 
 
-@pytest.mark.skipif(bool(MISSING), reason=REASON)
-def test_a_driver_that_does_not_run_is_reported_with_the_topics_that_are_missing(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("node", "parameters", "topic"),
+    [
+        pytest.param(
+            "camera_skeleton",
+            {"camera": "camera1", "driver": "realsense"},
+            "/camera/camera1/color/image_raw",
+            marks=pytest.mark.skipif(bool(MISSING), reason=REASON),
+        ),
+        ("marker_detector", {"setup": str(ROOT / "config" / "marker_setup")}, "/left/image_raw, /right/image_raw"),
+    ],
+)
+def test_a_driver_that_does_not_run_is_reported_with_the_topics_that_are_missing(
+    node: str, parameters: dict[str, str], topic: str, tmp_path: Path
+) -> None:
     with Running(tmp_path) as running:
-        running.start("camera_skeleton", camera="camera1", driver="realsense")
-        assert running.until(lambda: running.said("camera_skeleton").get("level") == "1", timeout=60.0)
-    text = running.said("camera_skeleton")[""]
-    assert text.startswith("nothing arrives on ") and "/camera/camera1/color/image_raw" in text
+        running.start(node, **parameters)
+        assert running.until(lambda: running.said(node).get("level") == "1", timeout=60.0)
+    text = running.said(node)[""]
+    assert text.startswith("nothing arrives on ") and topic in text
