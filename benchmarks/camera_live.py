@@ -107,10 +107,10 @@ def measured(cameras: int, rate: float, seconds: float, warm_up: float) -> dict[
     first = {each.colour + COMPRESSED: 1 for each in topics.values()}
     with live.graph_of(bench, first, poses=poses, sensors=(), camera=tuple(names), compressed="colour") as running:
         nodes = [psutil.Process(each.pid) for each in running if EXECUTABLE in each.args]
-        begun, before = sum(live.cpu_seconds(each).sum() for each in nodes), used_pairs(bench, names)
+        begun, before = sum(live.cpu_seconds(each) for each in nodes), used_pairs(bench, names)
         bench.publish(events(), {topics[names[0]].colour + COMPRESSED: "angles"}, 1.0 + warm_up)
         time.sleep(2.5)
-        used, after = sum(live.cpu_seconds(each).sum() for each in nodes) - begun, used_pairs(bench, names)
+        used, after = sum(live.cpu_seconds(each) for each in nodes) - begun, used_pairs(bench, names)
     values = [dict(bench.values(f"{name}_skeleton")) for name in names]
     delays, lost = bench.delays_ms("angles")
     return {

@@ -67,7 +67,7 @@ def person_in(model: PoseModel, image: ImageArray) -> Landmarks:
     return next(iter(people.values()))
 
 
-def kinect(model: PoseModel, folder: Path, joints: bool) -> tuple[dict[str, float], ImageArray]:
+def kinect(model: PoseModel, folder: Path) -> tuple[dict[str, float], ImageArray]:
     """Distances to the Kinect's joints, mm, and the image with the landmarks."""
     image = read(folder / "lab_004378_color.png")
     depth = to_metres(cv2.imread(str(folder / "lab_004378_depth.png"), cv2.IMREAD_UNCHANGED))
@@ -80,17 +80,13 @@ def kinect(model: PoseModel, folder: Path, joints: bool) -> tuple[dict[str, floa
     found = person_in(model, clean)
     lifted = lift(found, depth, camera)
     assert lifted is not None
-    known = np.flatnonzero(np.isfinite(lifted.positions).all(axis=1))
-    ours = lifted.positions[known]
+    ours = lifted.positions[np.isfinite(lifted.positions).all(axis=1)]
     # a dot has no depth: compare it at the depth of the paired joint
     rays = np.column_stack([camera.undistort(places), np.ones(len(places))])
     apart = np.linalg.norm(rays[:, None] * ours[None, :, 2:] - ours[None], axis=2)
     # a dot without a joint of ours (here the Kinect's knees) must not push the others to wrong joints
     rows, columns = linear_sum_assignment(np.minimum(apart, NOBODYS))
     away = 1e3 * apart[rows, columns]
-    if joints:
-        for k, row in enumerate(rows):
-            print(f"  dot {np.round(places[row]).astype(int)} {Joint(known[columns[k]]).name} {away[k]:.0f} mm")
     figures = {
         "joints of the Kinect": len(places),
         "of ours": len(ours),
@@ -154,7 +150,6 @@ def main() -> int:
     parser = common.parser(__doc__, data=True)
     parser.add_argument("--video", type=Path, metavar="FILE", help="of pedestrians")
     parser.add_argument("--portrait", type=Path, metavar="FILE", help="an image of an upper body")
-    parser.add_argument("--joints", action="store_true", help="also a row for each joint of the Kinect")
     parser.add_argument("--draw", type=Path, metavar="FOLDER", help="write the images with landmarks there")
     args = parser.parse_args()
     model = PoseModel(default_folder())
@@ -162,7 +157,7 @@ def main() -> int:
     met: dict[str, bool] = {}
     pictures: dict[str, ImageArray] = {}
     if (args.data / "kinect_depth").is_dir():
-        figures["kinect"], pictures["kinect"] = kinect(model, args.data / "kinect_depth", args.joints)
+        figures["kinect"], pictures["kinect"] = kinect(model, args.data / "kinect_depth")
         median = figures["kinect"]["median, mm"]
         met[f"kinect: median {median:.0f} mm, at most {KINECT_BAR_MM:g}"] = median <= KINECT_BAR_MM
     if args.video is not None:

@@ -25,10 +25,9 @@ from typing import Any
 import common
 import live
 import numpy as np
-import psutil
 
 from body_tracking.core.clocks import ClockModel
-from body_tracking.core.skeleton import NANOSECONDS, FloatArray
+from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.core.sources import RecordedFrame
 from body_tracking.kinect.simulated import KinectErrors
 from body_tracking.pipeline import graph
@@ -113,12 +112,6 @@ def listen(ear: live.Ear, wall: float, alive: Callable[[], bool]) -> None:
         ear.executor.spin_once(timeout_sec=min(0.2, max(0.0, wall - time.time())))
 
 
-def _machine() -> FloatArray:
-    """(2,) seconds of work of all processors for any process, and seconds stolen by the host."""
-    times = psutil.cpu_times()
-    return np.array([sum(times[:3]), times.steal])  # user, nice, system
-
-
 def measure(seconds: float) -> dict[str, Any]:
     """Run the graph once."""
     recording = simulate(SETTLE + seconds + TAIL)
@@ -139,15 +132,11 @@ def measure(seconds: float) -> dict[str, Any]:
 
         listen(ear, start + SETTLE, alive)
         processes = live.nodes_of(up.pid)
-        everybody = {**processes, "up": psutil.Process(up.pid), "bench": psutil.Process()}
-        before = {name: live.cpu_seconds(process) for name, process in everybody.items()}
-        begin, machine = time.monotonic(), _machine()
+        before = {name: live.cpu_seconds(process) for name, process in processes.items()}
+        begin = time.monotonic()
         listen(ear, start + SETTLE + seconds, alive)
         elapsed = time.monotonic() - begin
-        used = {name: live.cpu_seconds(process) - before[name] for name, process in everybody.items()}
-        busy, stolen = (_machine() - machine) / elapsed
-        others = max(0.0, busy - sum(float(each.sum()) for each in used.values()) / elapsed)
-        share = {name: float(used[name].sum()) / elapsed for name in processes}
+        share = {name: (live.cpu_seconds(process) - before[name]) / elapsed for name, process in processes.items()}
         # the last frame is through, and all nodes have published diagnostics once more
         listen(ear, start + max(_delivered(frame) for frame in recording.frames) / NANOSECONDS + 2.5, alive)
     if "skeleton_filter" not in share or "skeleton_filter" not in ear.statuses:
@@ -165,12 +154,7 @@ def measure(seconds: float) -> dict[str, Any]:
             **{name: int(ear.number("skeleton_filter", name)) for name in ("frames", "late_frames", "taken_again")},
         },
         "outputs": outputs,
-        "others_percent": round(100.0 * others, 1),
-        "steal_percent": round(100.0 * stolen, 1),
-        "cores": psutil.cpu_count(),
         "filter_percent_of_all": round(100.0 * share["skeleton_filter"] / share_of_outputs, 1),
-        "filter_user_s": round(float(used["skeleton_filter"][0]), 2),
-        "filter_system_s": round(float(used["skeleton_filter"][1]), 2),
         "cpu_percent": {name: round(100.0 * value, 1) for name, value in sorted(share.items(), key=lambda i: -i[1])},
     }
 

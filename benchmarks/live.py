@@ -170,10 +170,10 @@ def nodes_of(pid: int) -> dict[str, psutil.Process]:
     return found
 
 
-def cpu_seconds(process: psutil.Process, children: bool = False) -> FloatArray:
-    """(2,) user and system time, seconds; with that of its children if requested."""
-    times = [each.cpu_times() for each in (process, *(process.children(recursive=True) if children else ()))]
-    return np.array([[each.user, each.system] for each in times]).sum(axis=0)
+def cpu_seconds(process: psutil.Process, children: bool = False) -> float:
+    """Processor time, user and system, seconds; with that of its children if requested."""
+    counted = (process, *(process.children(recursive=True) if children else ()))
+    return float(sum(sum(each.cpu_times()[:2]) for each in counted))
 
 
 # --- the node of a benchmark

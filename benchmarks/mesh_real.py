@@ -33,7 +33,6 @@ from body_tracking.mesh.body_model import Body, load
 from body_tracking.mesh.depth import DepthCamera, to_metres
 from body_tracking.mesh.energy import Observation
 from body_tracking.mesh.personalisation import Person, personalise
-from body_tracking.mesh.picture import overlay
 from body_tracking.mesh.raster import render
 from body_tracking.mesh.solver import Fit, MeshFitter
 from body_tracking.mesh.tracking import MeshTracker, observe_person
@@ -91,7 +90,7 @@ def largest_piece(mask: BoolArray) -> BoolArray:
     return np.asarray(labels == 1 + statistics[1:, cv2.CC_STAT_AREA].argmax())
 
 
-def walker(folder: Path, pictures: Path | None) -> dict[str, dict[str, float]]:
+def walker(folder: Path) -> dict[str, dict[str, float]]:
     """The Kinect's image, by a search: with the mean person's body, and with a shape from this one image."""
     files = recordings(folder, ("lab_004378_depth.png", "lab_004378_mask.png"))
     pixels, masked = (cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in files)
@@ -101,11 +100,8 @@ def walker(folder: Path, pictures: Path | None) -> dict[str, dict[str, float]]:
     model = load()
     first = MeshFitter(model.body()).search(seen)
     own = personalise(model, [seen], [first.pose]).fits[0]
-    found = {}
-    for name, fit in (("mean person", first), ("own shape", own)):
-        found[name] = figures_of(Shown(seen, fit), mask, model.faces)
-        draw(pictures, f"walker_{name.split()[0]}", depth, fit, model.faces, seen.camera)
-    return found
+    fits = {"mean person": first, "own shape": own}
+    return {name: figures_of(Shown(seen, fit), mask, model.faces) for name, fit in fits.items()}
 
 
 def read_views(folder: Path) -> list[View]:
@@ -153,7 +149,7 @@ def torso(views: Sequence[View], shown: dict[int, Shown], chosen: Sequence[int],
     return {"torso": median(combinations(turns.values(), 2)), "neighbours": median(pairwise(turns.values()))}
 
 
-def turning(folder: Path, pictures: Path | None) -> dict[str, Any]:
+def turning(folder: Path) -> dict[str, Any]:
     """The turning person: figures of the views that were not used for the shape, and shoulder widths."""
     views = read_views(folder)
     matrix = np.array([[525.0, 0.0, 320.0], [0.0, 525.0, 240.0], [0.0, 0.0, 1.0]])
@@ -181,27 +177,15 @@ def turning(folder: Path, pictures: Path | None) -> dict[str, Any]:
         other = person_of(first, chosen, mean)
         shown = tracked(views, view, other.body, other.covariance)
         torsos.append(torso(views, shown, [n for n in range(len(views)) if n not in chosen], thorax)["torso"])
-    for number, one in runs["own shape"].items():
-        draw(pictures, f"turn_{number:02}", views[number].depth, one.fit, model.faces, view.camera)
     widths = [1e3 * float(np.linalg.norm(np.diff(each.body.joints[shoulders], axis=0))) for each in people]
     spread = {"median": float(np.median(torsos)), "least": min(torsos), "most": max(torsos)}
     return {"views": rows, "shoulder widths, mm": widths, "torso by ten choices of six views": spread}
 
 
-def draw(folder: Path | None, name: str, depth: SingleArray, fit: Fit, faces: Any, camera: Camera) -> None:
-    """Write a picture of a fit."""
-    if folder is not None:
-        folder.mkdir(parents=True, exist_ok=True)
-        image = overlay(depth, fit.posed.vertices[faces], camera)
-        cv2.imwrite(str(folder / f"{name}.png"), np.ascontiguousarray(image[..., ::-1]))
-
-
 def main() -> int:
-    parser = common.parser(__doc__, data=True)
-    parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="write pictures of the fits there")
-    arguments = parser.parse_args()
-    kinect = walker(arguments.data / "kinect_depth", arguments.pictures)
-    turn = turning(arguments.data / "depth_turn", arguments.pictures)
+    arguments = common.parser(__doc__, data=True).parse_args()
+    kinect = walker(arguments.data / "kinect_depth")
+    turn = turning(arguments.data / "depth_turn")
     report(arguments, {"kinect_depth": kinect, "depth_turn": turn})
     own, widths = turn["views"]["own shape"], turn["shoulder widths, mm"]
     return verdicts(

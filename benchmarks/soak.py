@@ -1,7 +1,7 @@
 """The full graph for an hour at ten times the rate: does memory grow, does a process die, does latency grow?
 
-``body_tracking up`` plays a simulated recording of a person with two Kinects (and, with ``--imus``, inertial sensors)
-in a loop, and records. At each start of the loop stamps jump back, and every node resets. Once a minute the recorder
+``body_tracking up`` plays a simulated recording of a person with two Kinects in a loop, and
+records. At each start of the loop stamps jump back, and every node resets. Once a minute the recorder
 closes its bag through its service, the bag is deleted, and the next one begins. At the end every node is killed once.
 
 Memory is the private part of each process (USS), which does not depend on other processes with the same libraries.
@@ -38,7 +38,6 @@ from std_srvs.srv import Trigger
 from tqdm import tqdm
 
 from body_tracking.core.skeleton import FloatArray
-from body_tracking.filters import DEFAULT_FILTER, FILTERS
 from body_tracking.pipeline import graph
 from body_tracking.recording.rosbag2 import BagReader
 from body_tracking.ros import dds
@@ -135,23 +134,9 @@ class Ear(live.Ear):
 
 def up_command(folder: Path, bag: Path, args: argparse.Namespace) -> list[str]:
     """Command line of ``body_tracking up`` with a bag in a loop, and a recorder."""
-    values: dict[str, dict[str, Any]] = {"bag_player": {"loop": True}}
-    if args.imus:
-        values["imu_skeleton"] = {"segments": [f"{name}:imu_{name}" for name in graph.EXAMPLE_IMUS]}
-    parameters = live.parameters_file(folder / "parameters.yaml", values)
-    words = ["--bag", bag, "--rate", args.rate, "--filter", args.filter, "--record", folder / "recording"]
+    parameters = live.parameters_file(folder / "parameters.yaml", {"bag_player": {"loop": True}})
+    words = ["--bag", bag, "--rate", args.rate, "--record", folder / "recording"]
     return live.up_command(*words, "--log-dir", folder, "--params-file", parameters)
-
-
-def simulated(folder: Path, imus: bool) -> Path:
-    """A simulated recording of a minute."""
-    bag = folder / "bag"
-    command = [sys.executable, "-m", "body_tracking.cli", "simulate", "-o", str(bag), "--motion", "torso_twist"]
-    command += ["--seconds", str(BAG_SECONDS)]
-    subprocess.run(
-        command + (["--imus", ",".join(graph.EXAMPLE_IMUS)] if imus else []), check=True, stdout=subprocess.DEVNULL
-    )
-    return bag
 
 
 # --- the measurement
@@ -173,7 +158,9 @@ def sample(samples: Samples, now: float, processes: Mapping[str, psutil.Process]
 def soak(args: argparse.Namespace, folder: Path) -> tuple[Samples, dict[str, Any]]:
     """Run the graph; returns the samples, and the recovery times of killed nodes."""
     samples = Samples()
-    bag = args.bag or simulated(folder, args.imus)
+    bag = folder / "bag"
+    command = [sys.executable, "-m", "body_tracking.cli", "simulate", "-o", str(bag), "--motion", "torso_twist"]
+    subprocess.run([*command, "--seconds", str(BAG_SECONDS)], check=True, stdout=subprocess.DEVNULL)
     with BagReader(bag) as reader:
         duration = (reader.end_ns - reader.start_ns) / 1e9
         sensor = graph.sensors_among(reader.topics)[0]
@@ -215,8 +202,8 @@ def soak(args: argparse.Namespace, folder: Path) -> tuple[Samples, dict[str, Any
             time.sleep(max(0.0, min(PERIOD, total) - LISTENING - (time.monotonic() - begin - now)))
             ear.listen(LISTENING)
         for name, process in live.nodes_of(up.pid).items():
-            cpu[name] = float(live.cpu_seconds(process).sum()) / (time.time() - process.create_time())
-        back = {name: _killed(name, up, ear) for name in pids} if args.kill else {}
+            cpu[name] = live.cpu_seconds(process) / (time.time() - process.create_time())
+        back = {name: _killed(name, up, ear) for name in pids}
     return samples, {"back_s": back, "cpu": cpu}
 
 
@@ -277,11 +264,9 @@ def result_of(samples: Samples, more: Mapping[str, Any], args: argparse.Namespac
     load = np.array(samples.machine)
     return {
         "minutes": args.minutes,
-        "filter": args.filter,
-        "imus": args.imus,
         "rate_asked": args.rate,
         "rate": round(float(played / elapsed), 2),
-        "taken_percent": None if args.imus else round(100.0 * float(taken / sent), 2),
+        "taken_percent": round(100.0 * float(taken / sent), 2),
         "load_average": round(float(load[:, 1].mean()), 2),
         "cores": psutil.cpu_count(),
         "processes": rows,
@@ -294,14 +279,12 @@ def result_of(samples: Samples, more: Mapping[str, Any], args: argparse.Namespac
 def bars(result: Mapping[str, Any]) -> dict[str, bool]:
     """Whether each bar is met."""
     latency = result["latency"]
-    met = {
+    return {
         "memory_flat": all(row["growth_percent"] <= 100.0 * GROWTH for row in result["processes"].values()),
         "nothing_died": not result["deaths"],
         "latency_unchanged": len(latency) > 1 and latency[-1]["median_ms"] <= LATER * latency[0]["median_ms"],
+        "every_node_back_after_a_kill": all(seconds is not None for seconds in result["back_s"].values()),
     }
-    if result["back_s"]:
-        met["every_node_back_after_a_kill"] = all(seconds is not None for seconds in result["back_s"].values())
-    return met
 
 
 def main() -> int:
@@ -309,10 +292,6 @@ def main() -> int:
     parser = common.parser(__doc__)
     parser.add_argument("--minutes", type=float, default=60.0, help="to run (default: %(default)g)")
     parser.add_argument("--rate", type=float, default=10.0, help="times the recording's (default: %(default)g)")
-    parser.add_argument("--filter", choices=FILTERS, default=DEFAULT_FILTER, help="(default: %(default)s)")
-    parser.add_argument("--imus", action="store_true", help="inertial sensors on the forearms, too")
-    parser.add_argument("--bag", type=Path, help="play this one (default: a minute is simulated)")
-    parser.add_argument("--no-kill", dest="kill", action="store_false", help="kill no node at the end")
     args = parser.parse_args()
     if not 0.5 <= args.minutes <= 1440.0:
         parser.error(f"--minutes {args.minutes:g}: expected 0.5 to 1440")

@@ -68,37 +68,26 @@ class Agreement:
 
     Attributes:
         samples: number of compared samples.
-        correlation: Pearson's, NaN if one of the series is constant.
         bias: mean of estimate minus reference, in the series' unit.
         rms: root mean square of the difference.
         debiased_rms: the same without the bias.
-        gain: slope of the estimate over the reference (least squares), NaN if the reference is constant.
     """
 
     samples: int
-    correlation: float
     bias: float
     rms: float
     debiased_rms: float
-    gain: float
 
 
 def compare(estimate: FloatArray, reference: FloatArray) -> Agreement:
-    """Statistics of ``estimate - reference``, (n,) each, over the samples where both are finite; at least two."""
+    """Statistics of ``estimate - reference``, (n,) each, over the samples where both are finite."""
     known = np.isfinite(estimate) & np.isfinite(reference)
-    a, b = estimate[known], reference[known]
-    difference = a - b
-    covariance = np.cov(a, b, bias=True)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        correlation = covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1])
-        gain = covariance[0, 1] / covariance[1, 1]
+    difference = estimate[known] - reference[known]
     return Agreement(
         samples=int(known.sum()),
-        correlation=float(correlation),
         bias=float(difference.mean()),
         rms=float(np.sqrt((difference**2).mean())),
         debiased_rms=float(difference.std()),
-        gain=float(gain),
     )
 
 

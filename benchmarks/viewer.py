@@ -121,10 +121,10 @@ def measure(seconds: float, pairs: int, sharpness: float) -> dict[str, Any]:
         for number in range(pairs):
             stretch("off")
             with viewer(page, folder, sharpness) as shown:
-                before = [live.cpu_seconds(each, children=True).sum() for each in (shown, browser)]
+                before = [live.cpu_seconds(each, children=True) for each in (shown, browser)]
                 stretch("on")
                 for name, process, had in zip(used, (shown, browser), before, strict=True):
-                    taken = live.cpu_seconds(process, children=True).sum() - had
+                    taken = live.cpu_seconds(process, children=True) - had
                     used[name].append(float(taken) / (SETTLE + seconds))
             common.progress(f"stretch {number + 1} of {pairs}")
         stretch("off")

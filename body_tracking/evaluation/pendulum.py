@@ -233,15 +233,6 @@ class Decay:
     gyroscope: Swing
 
 
-def is_vicon_pendulum(path: Path) -> bool:
-    """Whether a ``.csv`` or ``.csv.gz`` file has the data set's layout.
-
-    Raises:
-        CsvError: the file cannot be read.
-    """
-    return next(CsvFile(path).lines(), "").startswith(_HEADER)
-
-
 def vicon_decays(path: Path) -> list[Decay]:
     """The decays of a link of the pendulum (RepoIMU; Szczesna et al. 2016), one per release.
 
@@ -251,7 +242,7 @@ def vicon_decays(path: Path) -> list[Decay]:
         CsvError: the file cannot be read.
         PendulumError: another layout, or no decay.
     """
-    if not is_vicon_pendulum(path):
+    if not next(CsvFile(path).lines(), "").startswith(_HEADER):
         raise PendulumError(f"{path}: the header is not that of Szczesna et al. (2016), {_HEADER!r}...")
     try:
         rows = np.array(

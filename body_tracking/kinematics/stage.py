@@ -21,7 +21,7 @@ from body_tracking.kinematics.positional import positional_angles
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.codecs import Angles, ModelCovariance, ModelState
 from body_tracking.pipeline import graph
-from body_tracking.pipeline.people import ALL, PEOPLE, PeopleParameters, people_from
+from body_tracking.pipeline.people import ALL, PEOPLE, people_from
 from body_tracking.pipeline.shared import BODY, RELIABLE, result_qos, skeleton_input, skeleton_qos
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
 
@@ -168,25 +168,6 @@ class AngleStream:
             self.reset()
 
 
-def angle_streams(
-    convention: str, body: str, people: PeopleParameters, of_bones: float = BONE_CORRELATION
-) -> dict[str, AngleStream]:
-    """Joint angles in one convention, of each person who may be tracked, by id.
-
-    Args:
-        convention: one of ``ALL_CONVENTIONS``.
-        body: the id of one subject.
-        people: whom to track.
-        of_bones: correlation of the errors of the two joints of a bone.
-
-    Raises:
-        ConventionError: unknown convention.
-    """
-    if people.subject != ALL:
-        return {body: AngleStream(convention, of_bones=of_bones)}
-    return {each: AngleStream(convention, _AWAY_S, of_bones) for each in graph.bodies(people.people)}
-
-
 def by_person(skeletons: Sequence[Skeleton], ids: Collection[str], *, several: bool) -> Iterator[tuple[str, Skeleton]]:
     """The skeletons of one message, each with the id of its person.
 
@@ -259,7 +240,11 @@ class AnglesStage(Stage):
         people = people_from(values)
         self._several = people.subject == ALL
         of_bones = float(str(values["bone_correlation"]))
-        self.streams = angle_streams(convention, graph.check_body(str(values["body"])), people, of_bones)
+        body = graph.check_body(str(values["body"]))
+        if self._several:
+            self.streams = {each: AngleStream(convention, _AWAY_S, of_bones) for each in graph.bodies(people.people)}
+        else:
+            self.streams = {body: AngleStream(convention, of_bones=of_bones)}
         self._waiting = {body: OrderedDict() for body in self.streams}
         self._states: dict[str, str] = {}
         self._covariances: dict[str, str] = {}

@@ -59,13 +59,6 @@ class _SignalHandler:
         threading.Thread(target=self._wait, daemon=True).start()
         release_signals()
 
-    def ignore_sigint(self) -> None:
-        """Ignore another Ctrl-C, as ``ros2 launch`` passes it on, while Python shuts down.
-
-        Python removes its handlers then, except for ignored signals.
-        """
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-
     def _wait(self) -> None:
         while True:
             number = self._reader.recv(1)[0]
@@ -149,6 +142,7 @@ def run(node_class: type[GraphNode]) -> None:
                 with contextlib.suppress(InvalidHandle):
                     node.destroy_node()
             rclpy.try_shutdown()
-        handler.ignore_sigint()
+        # Python removes its handlers while it shuts down, except for ignored signals; ros2 launch passes Ctrl-C on then
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
     if code:
         sys.exit(code)

@@ -70,11 +70,12 @@ def make_shipped(bags: Path, rig_folder: Path) -> None:
     """
     people = needed_makehuman()
     scene = DepthScene(held_out(people, 1), "reaching", 1, colour_camera(_WIDTH // 2), still=True)
-    write_camera_bag(scene, bags / SHIPPED, SECONDS, overwrite=True)
+    messages = camera_messages(scene, SECONDS, truth=True)
+    write_bag(bags / SHIPPED, {**camera_topics(), **TRUTH}, messages, overwrite=True)
     turning = DepthScene(held_out(people, 3), "torso_twist", 3, colour_camera(_WIDTH // 4))
     poses = [pose_around(f"camera{number + 1}", angle) for number, angle in enumerate(_AROUND)]
     save_rig(rig_of(poses, colour_camera(_WIDTH)), rig_folder / setup.RIG)
-    write_pair_bag(turning, poses, bags / SHIPPED_PAIR, PAIR_SECONDS, overwrite=True)
+    write_pair_bag(turning, poses, bags / SHIPPED_PAIR, PAIR_SECONDS)
     for name in (SHIPPED, SHIPPED_PAIR):
         print_bag(bags / name, "images")
 
@@ -97,13 +98,11 @@ def rig_of(poses: Sequence[SensorPose], camera: Camera) -> Rig:
     return Rig(cameras, rotations, translations, np.zeros((size, size)))
 
 
-def write_pair_bag(
-    scene: DepthScene, poses: Sequence[SensorPose], folder: Path, seconds: float, *, overwrite: bool = False
-) -> None:
-    """Write colour images of a scene from several cameras as a bag, with progress on stderr.
+def write_pair_bag(scene: DepthScene, poses: Sequence[SensorPose], folder: Path, seconds: float) -> None:
+    """Write colour images of a scene from several cameras as a bag, replacing an existing one; progress on stderr.
 
     Raises:
-        BagError: the folder exists and ``overwrite`` is false, or it cannot be written.
+        BagError: it cannot be written.
     """
     painters = {
         DRIVERS["plain"].of(pose.sensor).colour + COMPRESSED: Painter.of(scene, colour_camera(_WIDTH), pose)
@@ -123,7 +122,7 @@ def write_pair_bag(
         progress.end()
 
     topics = {**dict.fromkeys(painters, (COMPRESSED_IMAGE, IMAGES)), **TRUTH}
-    write_bag(folder, topics, messages(), overwrite=overwrite)
+    write_bag(folder, topics, messages(), overwrite=True)
 
 
 def _true_pose(pose: SensorPose) -> Message:
@@ -159,13 +158,3 @@ def camera_messages(scene: DepthScene, seconds: float, *, truth: bool) -> Iterat
             yield from truth_of(scene, frame, stamp_ns, log_ns)
         progress.at(index)
     progress.end()
-
-
-def write_camera_bag(scene: DepthScene, folder: Path, seconds: float, *, overwrite: bool = False) -> None:
-    """Write the first seconds of a scene as a bag, with progress on stderr.
-
-    Raises:
-        BagError: the folder exists and ``overwrite`` is false, or it cannot be written.
-    """
-    messages = camera_messages(scene, seconds, truth=True)
-    write_bag(folder, {**camera_topics(), **TRUTH}, messages, overwrite=overwrite)

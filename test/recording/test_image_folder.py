@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -77,88 +78,56 @@ def test_files_without_stamps_come_at_the_rate(tmp_path: Path) -> None:
     assert stamps == [100_000_000, 200_000_000, 300_000_000]
 
 
-def _no_info(images: Path) -> None:
-    (images / "camera_info.yaml").unlink()
+def info(images: Path) -> Path:
+    return images / "camera_info.yaml"
 
 
-def _no_matrix(images: Path) -> None:
-    (images / "camera_info.yaml").write_text("image_width: 64\nimage_height: 48\n")
+def last(images: Path, kind: str) -> Path:
+    return sorted((images / kind).iterdir())[-1]
 
 
-def _uncalibrated(images: Path) -> None:
-    text = (images / "camera_info.yaml").read_text()
-    (images / "camera_info.yaml").write_text(text.replace("50.0", "0.0"))
-
-
-def _no_yaml(images: Path) -> None:
-    (images / "camera_info.yaml").write_text("[" * 1000)
-
-
-def _colour_as_depth(images: Path) -> None:
-    first = sorted((images / "depth").iterdir())[-1]
-    assert cv2.imwrite(str(first), np.zeros((4, 4, 3), np.uint8))
-
-
-def _cut_depth(images: Path) -> None:
-    last = sorted((images / "depth").iterdir())[-1]
-    last.write_bytes(last.read_bytes()[:-20])
-
-
-def _cut_colour(images: Path) -> None:
-    last = sorted((images / "rgb").iterdir())[-1]
-    last.write_bytes(last.read_bytes()[:-20])
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-20])
 
 
 def _cut_jpeg(images: Path) -> None:
-    last = sorted((images / "rgb").iterdir())[-1].rename(images / "rgb" / "2.5.jpg")
-    last.write_bytes(cv2.imencode(".jpg", np.zeros((48, 64, 3), np.uint8))[1].tobytes()[:-20])
-
-
-def _empty_colour(images: Path) -> None:
-    sorted((images / "rgb").iterdir())[-1].write_bytes(b"")
-
-
-def _text_as_colour(images: Path) -> None:
-    sorted((images / "rgb").iterdir())[-1].write_text("no image")
-
-
-def _list_as_info(images: Path) -> None:
-    (images / "camera_info.yaml").write_text("- 1\n")
+    jpeg = last(images, "rgb").rename(images / "rgb" / "2.5.jpg")
+    jpeg.write_bytes(cv2.imencode(".jpg", np.zeros((48, 64, 3), np.uint8))[1].tobytes()[:-20])
 
 
 def _list_as_matrix(images: Path) -> None:
-    info = yaml.safe_load((images / "camera_info.yaml").read_text())
-    (images / "camera_info.yaml").write_text(yaml.safe_dump(info | {"camera_matrix": [1.0] * 9}))
-
-
-def _nothing(images: Path) -> None:
-    for path in (images / "rgb").iterdir():
-        path.unlink()
+    known = yaml.safe_load(info(images).read_text())
+    info(images).write_text(yaml.safe_dump(known | {"camera_matrix": [1.0] * 9}))
 
 
 @pytest.mark.parametrize(
     ("spoil", "reason"),
     [
-        (_no_info, "camera_info.yaml"),
-        (_no_matrix, "camera_matrix is missing"),
-        (_uncalibrated, "calibrated"),
-        (_no_yaml, "camera_info.yaml"),
-        (_colour_as_depth, "no PNG image of 16 bits"),
-        (_nothing, "no PNG or JPEG images"),
-        (_cut_depth, r"depth/1305031102\.243211\.png: cut off after \d+ bytes"),
-        (_cut_colour, r"rgb/1305031102\.243211\.png: cut off after \d+ bytes"),
+        (lambda images: info(images).unlink(), "camera_info.yaml"),
+        (lambda images: info(images).write_text("image_width: 64\nimage_height: 48\n"), "camera_matrix is missing"),
+        (lambda images: info(images).write_text(info(images).read_text().replace("50.0", "0.0")), "calibrated"),
+        (lambda images: info(images).write_text("[" * 1000), "camera_info.yaml"),
+        (
+            lambda images: cv2.imwrite(str(last(images, "depth")), np.zeros((4, 4, 3), np.uint8)),
+            "no PNG image of 16 bits",
+        ),
+        (lambda images: [path.unlink() for path in (images / "rgb").iterdir()], "no PNG or JPEG images"),
+        (lambda images: cut(last(images, "depth")), r"depth/1305031102\.243211\.png: cut off after \d+ bytes"),
+        (lambda images: cut(last(images, "rgb")), r"rgb/1305031102\.243211\.png: cut off after \d+ bytes"),
         (_cut_jpeg, r"rgb/2\.5\.jpg: cut off after \d+ bytes"),
-        (_empty_colour, r"243211\.png: the file is empty"),
-        (_text_as_colour, r"243211\.png: no PNG or JPEG image"),
-        (_list_as_info, "camera_info.yaml: no intrinsics as ROS's camera_calibration writes them"),
+        (lambda images: last(images, "rgb").write_bytes(b""), r"243211\.png: the file is empty"),
+        (lambda images: last(images, "rgb").write_text("no image"), r"243211\.png: no PNG or JPEG image"),
+        (
+            lambda images: info(images).write_text("- 1\n"),
+            "camera_info.yaml: no intrinsics as ROS's camera_calibration writes them",
+        ),
         (_list_as_matrix, "camera_info.yaml: camera_matrix: expected rows, cols and data"),
     ],
 )
 def test_a_folder_that_cannot_be_used_is_named_and_leaves_no_bag(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str], spoil: object, reason: str
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], spoil: Callable[[Path], object], reason: str
 ) -> None:
     images = folder(tmp_path / "images")
-    assert callable(spoil)
     spoil(images)
     with pytest.raises(BodyTrackingError, match=reason):
         import_folder(images, tmp_path / "bag", "camera1", 30.0, 1000.0)
