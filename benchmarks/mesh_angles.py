@@ -71,9 +71,7 @@ def floor_of(scene: DepthScene, seconds: float) -> dict[str, tuple[FloatArray, F
         pairs.append([_positional(scene.pose.apply(joints)) for joints in (fitted, frame.joints)])
     found = {}
     for kind, names in ANGLES.items():
-        angles = np.array(
-            [[[each.position[each.names.index(name)] for name in names] for each in both] for both in pairs]
-        )
+        angles = np.array([[_named(each, names) for each in both] for both in pairs])
         off = wrapped(angles[:, 0] - angles[:, 1])
         found[kind] = off, np.full(off.shape, np.nan)
     return found

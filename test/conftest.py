@@ -9,7 +9,7 @@ import shutil
 import signal
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 # As in the commands and nodes, before numpy is imported: BLAS sums in another order with more threads.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -20,6 +20,9 @@ from xdist.scheduler import LoadScopeScheduling
 
 from body_tracking.ros import dds
 from draws import ALL, draws
+
+if TYPE_CHECKING:
+    from body_tracking.messages.base import MessageTypes
 
 ROOT = Path(__file__).resolve().parent.parent
 # one set of examples in `make test`, so that a change is to blame when it fails; others each time in `make test-all`
@@ -109,6 +112,18 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"real recordings are absent ({folder}): set BODY_TRACKING_DATA to their folder")
     return folder
+
+
+@pytest.fixture(scope="module", params=["bag", "ros"])
+def types(request: pytest.FixtureRequest) -> MessageTypes:
+    """The message types of bags, and those of ROS where it is installed."""
+    from body_tracking.messages.base import RosMessages
+    from body_tracking.recording.rosbag2 import BAG_MESSAGES
+
+    if request.param == "bag":
+        return BAG_MESSAGES
+    pytest.importorskip("rclpy", reason="ROS is not installed")
+    return RosMessages()
 
 
 def _made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:

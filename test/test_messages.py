@@ -21,7 +21,7 @@ from body_tracking.core.sensor_poses import level_pose
 from body_tracking.core.skeleton import BONES, N_JOINTS, FloatArray, Joint, Skeleton
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.angles import angles_to_joint_states, joint_state_values, joint_states_to_angles
-from body_tracking.messages.base import MessageError, MessageTypes, RosMessages
+from body_tracking.messages.base import MessageError, MessageTypes
 from body_tracking.messages.diagnostics import diagnostics, statuses
 from body_tracking.messages.imus import message_to_magnetic_field, message_to_sample, sample_to_messages
 from body_tracking.messages.model import joint_state_to_segments, segments_to_joint_state
@@ -31,15 +31,6 @@ from body_tracking.recording.rosbag2 import BAG_MESSAGES, deserialize, serialize
 from body_tracking.viewing.colours import INFERRED, PALETTE
 from body_tracking.viewing.markers import Markers
 from body_tracking.viewing.shapes import ELLIPSOID_RADIUS, ellipsoids, figure, frustum
-
-
-@pytest.fixture(scope="module", params=["bag", "ros"])
-def types(request: pytest.FixtureRequest) -> MessageTypes:
-    if request.param == "bag":
-        return BAG_MESSAGES
-    pytest.importorskip("rclpy", reason="ROS is not installed")
-    return RosMessages()
-
 
 # --- angles, commands, states of nodes
 

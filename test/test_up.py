@@ -43,7 +43,6 @@ from spinning import spin_until  # noqa: E402
 BAGS = Path(__file__).resolve().parent.parent / "bags"
 BAG = BAGS / "tpose_wave"
 ANGLES = graph.joint_states_topic("body1")
-STDDEVS = graph.joint_states_stddev_topic("body1")
 NODES = ("joint_angles", "skeleton_filter", "fusion", "calibration", "bag_recorder", "bag_player")
 
 

@@ -65,9 +65,7 @@ class InverseKinematics:
         self.prior = PosturePrior(model, self.ranges)
         self._tables = model.tree, prior_table(model, self.ranges, self.prior)
         self._point = {Joint(joint): number for number, joint in enumerate(model.joints)}
-        names = model.coordinate_names
-        self._column = {name: number for number, name in enumerate(names)}
-        scalars = [names[v] for v in model.scalar_v]
+        scalars = [model.coordinate_names[v] for v in model.scalar_v]
         self._scalar = {name: int(model.scalar_q[number]) for number, name in enumerate(scalars)}
         self._hands = [model.segment_names.index(f"hand_{side}") for side in ("left", "right")]
         self._low_high = np.full((2, model.nq), np.nan)

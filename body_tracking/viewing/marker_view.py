@@ -90,7 +90,7 @@ class MarkerView:
     def start(self, server: Any) -> None:
         """Create the nodes of the scene and the widgets."""
         scene = server.scene
-        self._frame = scene.add_frame("/markers", show_axes=False, wxyz=_OPTICAL)
+        scene.add_frame("/markers", show_axes=False, wxyz=_OPTICAL)
         self._cameras = [] if self._rig is None else _frustums(scene, self._names, self._rig)
         self._points = Shapes(scene, "/markers/points", BALL, FILTERED)
         self._poses = {}

@@ -294,7 +294,7 @@ class Page:
         gui.main_panel.set_width(WIDTH)
         sensors = tuple(self._colours)
         self._panel = ControlPanel(self._server, self._controls, filters, conventions, sensors, start_page, self._plays)
-        self._legend = gui.add_html(self._legend_text())
+        gui.add_html(self._legend_text())
         with gui.add_folder("Show", expand_by_default=False):
             boxes = {name: self._checkbox(name, label, shown) for name, (label, shown) in self._choices.items()}
         self._frames_box = boxes["frames"]

@@ -17,19 +17,10 @@ from body_tracking.markers.messages import (
     target_pose_to_message,
 )
 from body_tracking.markers.observations import ImageBalls, Points, TargetPose
-from body_tracking.messages.base import MessageError, MessageTypes, RosMessages
+from body_tracking.messages.base import MessageError, MessageTypes
 from body_tracking.messages.images import array_to_image, image_to_array
-from body_tracking.recording.rosbag2 import BAG_MESSAGES
 
 STAMP_NS = 1_750_000_000_123_456_789
-
-
-@pytest.fixture(scope="module", params=["bag", "ros"])
-def types(request: pytest.FixtureRequest) -> MessageTypes:
-    if request.param == "bag":
-        return BAG_MESSAGES
-    pytest.importorskip("rclpy", reason="ROS is not installed")
-    return RosMessages()
 
 
 def spread(count: int, size: int) -> Any:
