@@ -37,7 +37,8 @@ from body_tracking.recording.rosbag2 import BAG_WIRE
 _TOLERANCE_NS: Final = NANOSECONDS // 500
 """Largest difference of the stamps in one set of images, as in ``marker_triangulation``."""
 _VIEWS: Final = 500
-"""Default number of wand places: the adjustment takes 30 MB and 10 ms per hundred places and camera."""
+"""Most places of the wand that are used, evenly spread over a recording: the adjustment takes 30 MB and 10 ms per
+hundred places and camera."""
 
 
 class WandRecordingError(BodyTrackingError):
@@ -79,14 +80,13 @@ def read_lenses(folders: Sequence[Path]) -> tuple[tuple[Camera, ...], FloatArray
     return tuple(cameras), np.asarray(block_diag(*parts), dtype=np.float64)
 
 
-def read_wand(path: Path, cameras: Sequence[Camera], wand: Wand, views: int = _VIEWS) -> WandRecording:
+def read_wand(path: Path, cameras: Sequence[Camera], wand: Wand) -> WandRecording:
     """Find the wand in a recording of images or balls.
 
     Args:
         path: of the recording.
         cameras: that saw the wand, with their frames.
         wand: the wand.
-        views: largest number of wand places, evenly spread over the recording.
 
     Raises:
         BagError: the recording cannot be read.
@@ -123,7 +123,7 @@ def read_wand(path: Path, cameras: Sequence[Camera], wand: Wand, views: int = _V
             progress.at(raw.log_time_ns)
         progress.end()
     found.extend(sets.poll(bag.end_ns + 2 * NANOSECONDS))
-    chosen_sets = np.unique(np.linspace(0, len(found) - 1, min(views, len(found))).round().astype(int)).tolist()
+    chosen_sets = np.unique(np.linspace(0, len(found) - 1, min(_VIEWS, len(found))).round().astype(int)).tolist()
     rows = [
         (frames.index(frame), view, ball, *pixel)
         for view, number in enumerate(chosen_sets)
@@ -171,7 +171,7 @@ def wand(args: argparse.Namespace) -> int:
         raise WandRecordingError(f"--places {args.places!r}: expected metres along the wand, as 0,0.15,0.45") from error
     held = Wand(places, args.deviation)
     cameras, covariance = read_lenses(args.lenses or [args.setup])
-    recording = read_wand(args.bag, cameras, held, args.views)
+    recording = read_wand(args.bag, cameras, held)
     found = calibrate_wand(cameras, recording.seen, held, covariance)
     if args.diameter:
         found = calibrate_wand(cameras, centred(found, recording.seen, args.diameter), held, covariance)
@@ -222,13 +222,6 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     parser.add_argument(
         "--diameter", type=float, default=0.0, metavar="METRES", help="of the balls; 0 takes centroids for centres"
-    )
-    parser.add_argument(
-        "--views",
-        type=int,
-        default=_VIEWS,
-        metavar="N",
-        help="places of the wand to use at most (default: %(default)s)",
     )
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
     parser.set_defaults(run=wand)

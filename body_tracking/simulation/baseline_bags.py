@@ -164,7 +164,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         metavar="S",
         help="by which the camera's stamps follow the robot's (default: %(default)s)",
     )
-    arm.add_argument("--width", type=int, default=1024, metavar="N", help="pixels of a colour image (%(default)s)")
     arm.set_defaults(run=_arm)
     pendulum = tests.add_parser("pendulum", help="pendulums with a retro-reflective ball: infrared and depth images")
     pendulum.add_argument(
@@ -182,14 +181,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def _arm(args: argparse.Namespace) -> int:
-    if not (1 <= args.trials <= 20 and abs(args.delay) <= 0.5 and 160 <= args.width <= 4096 and args.width % 8 == 0):
-        raise BaselineError(
-            f"--trials {args.trials}, --delay {args.delay}, --width {args.width}: expected 1 to 20 trials, at most "
-            "0.5 s, and 160 to 4096 pixels, a multiple of 8"
-        )
+    if not (1 <= args.trials <= 20 and abs(args.delay) <= 0.5):
+        raise BaselineError(f"--trials {args.trials}, --delay {args.delay}: expected 1 to 20 trials, at most 0.5 s")
     for number in range(args.trials):
         folder = args.output / f"trial{number + 1}"
-        scene = ArmScene(seed=args.seed * 1000 + number, width=args.width)
+        scene = ArmScene(seed=args.seed * 1000 + number)
         write_arm(scene, folder, args.delay, overwrite=args.overwrite)
         print_bag(folder, f"{scene.seconds:.1f} s of motion, stamps {1e3 * args.delay:.0f} ms late")
     return 0

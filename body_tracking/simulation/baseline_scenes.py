@@ -48,6 +48,8 @@ _WAYPOINTS: Final = np.array(
     ]
 )
 """Metres along the linear stage, and degrees of both links above the horizontal: the strokes of a painting robot."""
+_WIDTH: Final = 1024
+"""Pixels of a colour image; a depth image has half as many."""
 _LINE: Final = 1.8
 """Seconds from one waypoint to the next."""
 _REST: Final = 0.5
@@ -99,13 +101,11 @@ class ArmScene:
     Attributes:
         seed: of the sensor's errors.
         camera: the colour camera's name.
-        width: pixels of the colour image; the depth image has half as many.
         errors: of the depth.
     """
 
     seed: int = 0
     camera: str = "camera1"
-    width: int = 1024
     errors: DepthErrors = field(default_factory=DepthErrors)
 
     @property
@@ -121,12 +121,12 @@ class ArmScene:
     @cached_property
     def colour(self) -> Camera:
         """Intrinsics of the colour images."""
-        return colour_camera(self.width)
+        return colour_camera(_WIDTH)
 
     @cached_property
     def depth(self) -> Camera:
         """Intrinsics of the depth images, which are registered to the colour images."""
-        return colour_camera(self.width // 2)
+        return colour_camera(_WIDTH // 2)
 
     @cached_property
     def _view(self) -> DepthCamera:
