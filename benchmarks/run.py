@@ -81,6 +81,7 @@ BENCHMARKS = {
     "people": Benchmark(10, PAIRS),
     "accuracy": Benchmark(120, options="--seeds 2 --layout-seeds 1 --sensitivity-seeds 1"),
     "every_angle": Benchmark(5, options="--motions reaching,squat"),
+    "ablation": Benchmark(40, options="--seeds 1 --layouts 2,4"),
     "honesty": Benchmark(3, options="--runs 40"),
     "robustness": Benchmark(10, options="--runs 100"),
     "teleports": Benchmark(15, options="--runs 12"),
