@@ -133,6 +133,7 @@ class Fit:
         frames: (J, 3, 3) anatomical frames of its segments, columns in the camera's axes.
         energy: half the sum of the squared, robust residuals.
         information: (3 + 3 J, 3 + 3 J) inverse covariance of the pose's change, see :mod:`body_tracking.mesh.energy`.
+        pulled: part of the information by vertices outside of the silhouette or in front of the measured surface.
         matches: correspondences of the measured points.
         weights: (n,) of the measured points in the information, 1/m^2.
         matched: share of measured points explained by the body.
@@ -147,6 +148,7 @@ class Fit:
     frames: FloatArray
     energy: float
     information: FloatArray
+    pulled: FloatArray
     matches: Matches
     weights: FloatArray
     matched: float
@@ -409,6 +411,7 @@ class MeshFitter:
         robust, cost = _robust(pulls.residuals, 2.0 * scale)
         each = settings.patches / facing / np.where(pulls.kinds == 0, settings.silhouette, settings.front) ** 2
         pull_weights = each * robust
+        pulled = system.information.copy()
         if len(pulls.vertices):
             own = pulls.vertices[:, None]
             arms = lever_arms(
@@ -417,6 +420,7 @@ class MeshFitter:
             )
             system.add(arms, pulls.directions, pulls.residuals, pull_weights)
             total += float((each * cost).sum())
+        pulled = system.information - pulled
         total += self._add_angles(system, pose, None if prediction is None else prediction.hidden)
         if prediction is not None:
             total += self._add_prediction(system, pose, prediction)
@@ -429,8 +433,9 @@ class MeshFitter:
         violations = len(pulls.vertices) / facing
         information = system.information
         information += np.tril(information, -1).T
+        pulled += np.tril(pulled, -1).T
         fit = Fit(
-            *(pose, posed, frames, 0.5 * total, information, matches, weights, matched, violations),
+            *(pose, posed, frames, 0.5 * total, information, pulled, matches, weights, matched, violations),
             rms=float(np.sqrt((planes[near] ** 2).mean())) if near.any() else float("inf"),
             lost=1.0 - matched + violations > settings.unexplained,
         )

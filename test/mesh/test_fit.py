@@ -415,6 +415,26 @@ def test_covariance_of_a_hidden_forearm_is_larger_and_that_of_a_known_shape_smal
     assert stddevs[2][Joint.WRIST_RIGHT] < 1.3 * stddevs[0][Joint.WRIST_RIGHT]
 
 
+def test_an_arm_beside_the_silhouette_is_as_unknown_as_a_hidden_one(fitter: MeshFitter, camera: DepthCamera) -> None:
+    """The image shows where it is not: a wall in place of the left arm, which hangs."""
+    truth, model = fitter.neutral(PLACE, 0.1, 0.1), fitter.body.model
+    observation = seen(camera, fitter, truth, np.random.default_rng(13))
+    shown = raster.render(fitter.body.posed(truth).vertices, model.faces, CAMERA).faces
+    bones = model.bones[np.arange(len(model.vertices)), model.weights.argmax(axis=1)][model.faces[:, 0]]
+    arm = (shown >= 0) & np.isin(
+        bones[shown], [model.index(f"left_{joint}") for joint in ("shoulder", "elbow", "wrist")]
+    )
+    marks, stddevs, fits = uncertainty.kinect_landmarks(fitter.body), [], []
+    for distance in (1.0, 4.0):  # of what covers the arm, and of the wall behind it
+        depth = np.where(arm, np.float32(distance), observation.depth)
+        image = energy.observe(camera, depth, observation.mask & ~arm, 400)
+        fits.append(fitter.evaluate(image, truth, 0.05).fit)
+        covariance = uncertainty.placed(fitter, fits[-1], image, marks, np.zeros((12, 12))).covariance
+        stddevs.append(np.sqrt(np.trace(covariance[Joint.WRIST_LEFT])))
+    assert fits[1].violations > fits[0].violations + 0.1
+    assert stddevs[1] == pytest.approx(stddevs[0], rel=0.01)
+
+
 def test_shapes_of_people_from_three_poses(camera: DepthCamera) -> None:
     errors, distances = [], []
     for seed in range(6):
