@@ -80,6 +80,9 @@ START_DELAY = 5.0
 CANNOT_START = 2
 """Exit code of a node that cannot start; its last line of output states the reason."""
 
+NOTHING_RECORDED = 30.0
+"""Seconds from the start within which a graph that fails leaves no recording, since the next try would be refused."""
+
 STOP_TIMEOUT = 12.0
 """Seconds for a node to end after a signal."""
 
@@ -319,7 +322,8 @@ class Supervisor:
     def run(self, monitor: GraphMonitor) -> None:
         """Run until the bag ends, a user ends the graph or a node cannot start (reason: :attr:`failure`).
 
-        A graph that could not start, and gave no angles, leaves no recording.
+        A graph that could not start, and gave no angles, leaves no recording. A longer recording stays: another ``up``
+        may be discovered when a network comes back.
         """
         handlers = {number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
         handlers[signal.SIGHUP] = signal.signal(signal.SIGHUP, self._on_signal)
@@ -348,14 +352,15 @@ class Supervisor:
                     break
                 self.console.status(monitor.line(self.options, looked - begin, self._restarts()))
         finally:
+            ran = time.monotonic() - begin
             self._stop_all()
             for number, handler in handlers.items():
                 signal.signal(number, handler)
         self.console.end()
         if self.failure:
             self.console.line(f"body_tracking: {self.failure}", error=True)
-            # else the next try would be refused
-            if self.options["record"] and (not monitor.angles or monitor.has_predecessor()):
+            started = monitor.angles and not monitor.has_predecessor()
+            if self.options["record"] and ran < NOTHING_RECORDED and not started:
                 shutil.rmtree(str(self.options["record"]), ignore_errors=True)
             return
         elapsed = time.monotonic() - begin

@@ -29,9 +29,11 @@ from body_tracking.nodes.bag_recorder import BagRecorder  # noqa: E402
 from body_tracking.nodes.body_markers import BodyMarkers  # noqa: E402
 from body_tracking.nodes.robot_commands import RobotCommands  # noqa: E402
 from body_tracking.pipeline import graph  # noqa: E402
+from body_tracking.ros import up  # noqa: E402
 from body_tracking.ros.bag_topics import to_profile  # noqa: E402
 from body_tracking.ros.graph_monitor import GraphMonitor  # noqa: E402
 from body_tracking.ros.host import node_of  # noqa: E402
+from body_tracking.systems import options_of  # noqa: E402
 from spinning import spin_until  # noqa: E402
 
 ROBOT = Path(__file__).resolve().parents[2] / "config" / "robots" / "two_joint_arm.yaml"
@@ -160,7 +162,9 @@ def test_second_up_in_a_domain_ends_with_an_error(tmp_path: Path, monkeypatch: p
         first.close()
 
 
-def test_one_of_two_simultaneous_ups_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("late", [False, True])
+def test_one_of_two_simultaneous_ups_stays(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, late: bool) -> None:
+    """The other one ends; it leaves no recording, unless it ran for longer before it discovered the first."""
     for name, value in environment().items():
         monkeypatch.setenv(name, value)
     monitors = [GraphMonitor([graph.joint_states_topic("body1")]) for _ in range(2)]
@@ -168,5 +172,13 @@ def test_one_of_two_simultaneous_ups_stays(monkeypatch: pytest.MonkeyPatch) -> N
     while not monitors[1].has_predecessor() and time.monotonic() < end:
         time.sleep(0.05)
     assert [each.has_predecessor() for each in monitors] == [False, True]
+    recording = tmp_path / "recording"
+    recording.mkdir()
+    if late:
+        monkeypatch.setattr(up, "NOTHING_RECORDED", 0.0)
+    second = up.Supervisor(options_of(record=recording), (), {}, tmp_path)
+    second.run(monitors[1])
+    assert "another body_tracking up runs" in second.failure
+    assert recording.exists() == late
     monitors[0].close()
     monitors[1].close()
