@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 
 import pytest
 
+from body_tracking.core.errors import BodyTrackingError
 from body_tracking.ros import dds
 
 RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
@@ -31,6 +32,13 @@ def heartbeat() -> float:
     return sum(
         float(root.findtext(PERIOD + unit) or 0) * scale for unit, scale in (("{*}sec", 1), ("{*}nanosec", 1e-9))
     )
+
+
+@pytest.mark.parametrize("number", ["lab", "233", "-1"])
+def test_a_domain_that_ends_the_process_is_an_error_in_one_line(number: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", number)
+    with pytest.raises(BodyTrackingError, match=f"ROS_DOMAIN_ID is '{number}', expected 0 to 232"):
+        dds.prepare()
 
 
 def test_heartbeat_period_is_short() -> None:

@@ -12,7 +12,7 @@ from typing import Final, TypeAlias
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.extras import pip_install
 from body_tracking.ros import dds
-from body_tracking.ros.up import flags, has_sensors
+from body_tracking.ros.up import flags, has_sensors, no_ros
 
 _SHOWN: Final = 3
 """Recordings that are named at most."""
@@ -45,8 +45,10 @@ def steps(folder: Path) -> Iterator[Step]:
 
 def _domain(page: str) -> Iterator[Step]:
     """The next step by the nodes that publish in the ROS domain."""
-    from body_tracking.ros.discovery import PATIENCE, look
-
+    try:
+        from body_tracking.ros.discovery import PATIENCE, look
+    except ImportError as error:
+        raise no_ros(error) from error
     dds.stay_on_this_machine()
     dds.prepare()
     found = look()

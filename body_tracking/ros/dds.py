@@ -11,7 +11,10 @@ while there is something to be acknowledged.
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
+
+from body_tracking.core.errors import BodyTrackingError
 
 PROFILES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 """Environment variables that name a file of profiles for Fast DDS; the second is the older name."""
@@ -21,8 +24,29 @@ _RESEND, _LOOPBACK = _FOLDER / "resend.xml", _FOLDER / "loopback.xml"
 _RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 
 
+class DomainError(BodyTrackingError):
+    """``ROS_DOMAIN_ID`` is no domain; of some values the middleware ends the process."""
+
+
+def domain(variables: Mapping[str, str]) -> str:
+    """The ROS domain.
+
+    Raises:
+        DomainError: it is no number, or has no UDP ports.
+    """
+    text = variables.get("ROS_DOMAIN_ID") or "0"
+    if not (text.isdecimal() and int(text) <= 232):
+        raise DomainError(f"ROS_DOMAIN_ID is {text!r}, expected 0 to 232")
+    return text
+
+
 def prepare() -> None:
-    """Use the short heartbeat period, in this process, which must not have used ROS yet, and its children."""
+    """Use the short heartbeat period, in this process, which must not have used ROS yet, and its children.
+
+    Raises:
+        DomainError: no node can be made in the chosen domain.
+    """
+    domain(os.environ)
     if not any(os.environ.get(name) for name in PROFILES):
         _use(_RESEND)
 

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -23,6 +23,7 @@ from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.extras import pip_install
 from body_tracking.core.message_types import IMU, JOINT_STATE, POINT_CLOUD
 from body_tracking.pipeline import graph
+from body_tracking.ros import dds
 
 OK: Final = "OK"
 WARNING: Final = "warning"
@@ -43,6 +44,7 @@ _RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 _FAST_DDS = ("FASTDDS_BUILTIN_TRANSPORTS", "FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 _REMEDIES = {
     "No module named 'rclpy'": f"{pip_install('ros')}, or . /opt/ros/jazzy/setup.bash",
+    "ROS_DOMAIN_ID": "export ROS_DOMAIN_ID=0",
     "RMW": "unset RMW_IMPLEMENTATION, or install the middleware that it names",
     "shared object file": "unset _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH, in a shell without another ROS",
 }
@@ -67,18 +69,20 @@ class Finding:
 
 def environment(variables: Mapping[str, str]) -> Iterator[Finding]:
     """Contradictory variables, and domain and discovery range, which must be the same on all computers."""
-    domain = variables.get("ROS_DOMAIN_ID") or "0"
-    if not (domain.isdecimal() and int(domain) <= 232):  # those beyond have no UDP ports
-        yield Finding(PROBLEM, f"ROS_DOMAIN_ID is {domain!r}, expected 0 to 232", "export ROS_DOMAIN_ID=0")
+    try:
+        domain = f"ROS domain {dds.domain(variables)}, "
+    except dds.DomainError as error:
+        yield Finding(PROBLEM, str(error), "export ROS_DOMAIN_ID=0")
+        domain = ""
     reach = "LOCALHOST" if variables.get("ROS_LOCALHOST_ONLY") == "1" else variables.get(_RANGE) or "SUBNET"
     if reach not in ("SUBNET", "LOCALHOST", "SYSTEM_DEFAULT"):
         yield Finding(PROBLEM, f"{_RANGE} is {reach!r}: nodes do not find each other", f"export {_RANGE}=SUBNET")
     elif not several_machines(variables) and reach == "SUBNET":
         others = "body_tracking up stays on this machine, other nodes reach the network"
-        yield Finding(OK, f"ROS domain {domain}, discovery range not set: {others}")
+        yield Finding(OK, f"{domain}discovery range not set: {others}")
     else:
         peers = variables.get("ROS_STATIC_PEERS") or ("none" if reach == "LOCALHOST" else "those of the network")
-        yield Finding(OK, f"ROS domain {domain}, discovery range {reach}, other machines: {peers}")
+        yield Finding(OK, f"{domain}discovery range {reach}, other machines: {peers}")
     for name in ("ROS_LOCALHOST_ONLY", "ROS_DISCOVERY_SERVER", *_FAST_DDS):
         if variables.get(name):
             remedy = f"unset {name}, or set it alike in every shell"
@@ -91,9 +95,18 @@ def client_library() -> Finding:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     if done.returncode == 0:
         return Finding(OK, f"rclpy works, on {done.stdout.strip()}")
-    reason = [f"exit code {done.returncode}", *(line for line in done.stderr.splitlines() if line[:1].strip())][-1]
-    remedy = next((remedy for part, remedy in _REMEDIES.items() if part in reason), "see docs/troubleshooting.md")
+    lines = [f"exit code {done.returncode}", *(line for line in done.stderr.splitlines() if line[:1].strip())]
+    reason, remedy = cause(lines)
     return Finding(PROBLEM, f"no ROS node can be made: {reason}", remedy)
+
+
+def cause(lines: Sequence[str]) -> tuple[str, str]:
+    """The line of an error message for which there is a remedy, else its last one, and the remedy."""
+    for line in reversed(lines):
+        for part, remedy in _REMEDIES.items():
+            if part in line:
+                return line, remedy
+    return lines[-1], "see docs/troubleshooting.md"
 
 
 def several_machines(variables: Mapping[str, str]) -> bool:

@@ -30,7 +30,6 @@ import yaml
 from body_tracking.core import names
 from body_tracking.core.arguments import Parser
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.core.extras import pip_install
 from body_tracking.core.parameters import SECTION, Value, to_ros
 from body_tracking.core.signals import signals_held
 from body_tracking.core.skeleton import NANOSECONDS
@@ -42,6 +41,7 @@ from body_tracking.recording.finding import advice_for, unused, unused_imus
 from body_tracking.recording.rig import RigReader
 from body_tracking.robot.system import convention_of
 from body_tracking.ros import dds
+from body_tracking.ros.doctor import cause
 from body_tracking.systems import (
     FLOW,
     OPTIONS,
@@ -557,7 +557,8 @@ def arguments_from(words: Sequence[str]) -> argparse.Namespace:
 
 def no_ros(error: ImportError) -> UpError:
     """The error of a command that needs ROS where ROS cannot be imported."""
-    return UpError(f"no ROS here ({error}): {pip_install('ros')}, or source a ROS install")
+    reason, remedy = cause(str(error).splitlines())
+    return UpError(f"no ROS here ({reason}): {remedy}")
 
 
 def _sensors_there(namespace: str) -> Mapping[str, Value]:
@@ -639,9 +640,9 @@ def supervise(
     except ImportError as error:
         raise no_ros(error) from error
     all_parameters(options, specs, args.params_file)  # raises before a folder is made
-    folder = _log_folder(args.log_dir)
     dds.stay_on_this_machine()
     dds.prepare()
+    folder = _log_folder(args.log_dir)
     defaults: dict[str, dict[str, Value]] = {
         # from which a restarted calibration node continues
         "calibration": {"calibration_file": str(folder / "calibration.yaml")}

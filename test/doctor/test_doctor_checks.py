@@ -12,6 +12,7 @@ from body_tracking import cli
 from body_tracking.recording.rosbag2 import BagReader, BagWriter
 from body_tracking.ros import doctor
 from body_tracking.ros.doctor import OK, PROBLEM, WARNING, Finding, bag
+from body_tracking.ros.up import no_ros
 
 BAG = Path(__file__).resolve().parents[2] / "bags" / "tpose_wave"
 
@@ -43,6 +44,21 @@ def test_variables_that_separate_nodes_are_named(variables: dict[str, str], leve
     found = worst(doctor.environment(variables))
     assert found[0] == level
     assert reported in found[1]
+
+
+def test_a_domain_that_there_is_not_is_nowhere_called_right() -> None:
+    found = list(doctor.environment({"ROS_DOMAIN_ID": "300"}))
+    assert [each.level for each in found] == [PROBLEM, OK]
+    assert "300" not in found[1].found
+
+
+def test_a_library_that_is_not_found_has_its_remedy_also_where_the_message_goes_on() -> None:
+    error = "librcl_action.so: cannot open shared object file: No such file or directory"
+    more = "The C extension 'rclpy/_rclpy_pybind11.so' failed to be imported while being present on the system."
+    reason, remedy = doctor.cause([error, more])
+    assert (reason, remedy.split()[:2]) == (error, ["unset", "_ROS_WHEELS_BOOTSTRAP_COMPLETE"])
+    assert str(no_ros(ImportError(f"{error}\n{more}"))) == f"no ROS here ({error}): {remedy}"
+    assert doctor.cause(["exit code 1"]) == ("exit code 1", "see docs/troubleshooting.md")
 
 
 def test_missing_libraries_come_with_the_line_that_installs_them(monkeypatch: pytest.MonkeyPatch) -> None:
