@@ -73,6 +73,19 @@ def test_messages_that_a_node_did_not_process_are_reported_where_they_are_many()
     assert losses_part({"robot_commands": status(received=20, **{"dropped /joint_states": 2})}) == []  # at the start
 
 
+def test_a_reliable_graph_names_every_lost_message_and_another_one_names_the_option() -> None:
+    found = {"kinect1_mesh": NodeStatus("", 0, "", {"received": "299", "lost /kinect1/depth/image_raw": "2"})}
+    text = "messages not processed (machine or network too slow): kinect1_mesh 2"
+    assert losses_part(found) == []
+    assert losses_part(found, reliable=True) == [text]
+    monitor = object.__new__(GraphMonitor)  # without a node
+    monitor._statuses, monitor.angles = found, 298
+    options = {"bag": "reaching", "record": None, "reliable": True}
+    assert monitor.summary(options, 3.0, {}).endswith(f"298 frames of joint angles; {text}")
+    found["kinect1_mesh"].values["lost /kinect1/depth/image_raw"] = "50"
+    assert monitor.summary(options | {"reliable": False}, 3.0, {}).endswith("mesh 50; --reliable processes them, later")
+
+
 def monitor_without_node() -> GraphMonitor:
     monitor = object.__new__(GraphMonitor)
     monitor._angles_topics, monitor._namespace, monitor.angles, monitor.clock_ns = (), "/", 0, 0

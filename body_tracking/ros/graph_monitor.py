@@ -71,12 +71,15 @@ def problem_parts(statuses: Mapping[str, NodeStatus], waiting: Collection[str] =
     return [f"{name}: {text}" for name, text in sorted(bad.items())]
 
 
-def losses_part(statuses: Mapping[str, NodeStatus], before: Mapping[str, NodeStatus] | None = None) -> list[str]:
+def losses_part(
+    statuses: Mapping[str, NodeStatus], before: Mapping[str, NodeStatus] | None = None, *, reliable: bool = False
+) -> list[str]:
     """The messages that nodes did not process, where they are more than ten, and than one in a hundred received ones.
 
     Args:
         statuses: by node.
         before: earlier ones; only what came since counts.
+        reliable: no message should be lost, so a single one is named.
     """
     found = []
     for name, status in sorted(statuses.items()):
@@ -87,7 +90,7 @@ def losses_part(statuses: Mapping[str, NodeStatus], before: Mapping[str, NodeSta
             earlier = _losses(before[name])
             if earlier[0] <= lost and earlier[1] <= received:  # the node was not started anew
                 lost, received = lost - earlier[0], received - earlier[1]
-        if lost > max(_FEW, _NOTABLE_LOSS * received):
+        if lost > (0.0 if reliable else max(_FEW, _NOTABLE_LOSS * received)):
             found.append(f"{name} {lost:.0f}")
     return [f"messages not processed (machine or network too slow): {', '.join(found)}"] if found else []
 
@@ -232,7 +235,7 @@ class GraphMonitor:
         malformed = sum(int(status.values.get("malformed", 0)) for status in fresh.values())
         if malformed:
             parts.append(f"malformed {malformed}")
-        parts += losses_part(fresh, self._earlier(now))
+        parts += losses_part(fresh, self._earlier(now), reliable=bool(options["reliable"]))
         values = {f"{key}: {value}" for status in fresh.values() for key, value in status.values.items()}
         parts += sorted(each for each in values if each.startswith("publishers "))
         if options["robot"]:
@@ -312,7 +315,11 @@ class GraphMonitor:
             text += f", recorded in {options['record']}" if made else ", nothing was recorded"
         elif (recorder := self._statuses.get("bag_recorder")) is not None and recorder.number("messages"):
             text += f", recorded in {recorder.values.get('bag', '')}"  # by the page or the service
-        text += "".join(f"; {part}" for part in losses_part(self._statuses))
+        reliable = bool(options.get("reliable"))
+        losses = losses_part(self._statuses, reliable=reliable)
+        text += "".join(f"; {part}" for part in losses)
+        if losses and options["bag"] and not reliable:
+            text += "; --reliable processes them, later"
         if restarts:
             text += "; restarts: " + ", ".join(f"{name} {count}" for name, count in restarts.items())
         return text
