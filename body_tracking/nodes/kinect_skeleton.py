@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import traceback
 from dataclasses import replace
@@ -83,7 +84,8 @@ class KinectSkeleton(GraphNode):
         """Streaming, ended, failed, or the problem of the source."""
         problem = self.source_value("problem", "")
         if problem:
-            self.log_throttled("problem", problem, _PROBLEM_PERIOD_S)
+            kind = re.sub(r" \(from .*\)|[\d.]+", "", problem)  # a problem of another kind is logged at once
+            self.log_throttled(kind, problem, _PROBLEM_PERIOD_S)
         elif self.problem and not self.failure:
             self.get_logger().info("frames arrive")
         self.problem = problem

@@ -57,6 +57,7 @@ def test_a_sender_that_ends_and_comes_again_is_followed_without_a_restart(tmp_pa
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
             stranger.sendto(b"x" * 500, ("127.0.0.1", port))
         assert running.until(lambda: said().get("rejected, not ours") == "1", 30.0), said()
+        assert running.until(lambda: "packets are refused" in running.log("kinect_skeleton"), 20.0)  # not after 30 s
         log = running.log("kinect_skeleton")
         assert "no frame" in log and log.count("frames arrive") >= 2
 
