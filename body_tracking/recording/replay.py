@@ -218,7 +218,8 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
         overwrite: replace an existing ``out``.
 
     Raises:
-        ReplayError: no skeletons in the bag, or no images, balls or points of markers; ``out`` is the bag itself.
+        ReplayError: no skeletons in the bag, or no images, balls or points of markers; ``out`` is the bag itself; the
+            file of the person is missing.
         BagError: the bag cannot be read, or ``out`` cannot be written.
         CalibrationError: the calibration file belongs to other sensors.
     """
@@ -242,6 +243,9 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
         if settings.calibration_file is not None:
             lack = lacking(load(settings.calibration_file), settings.sensors)  # raises if it is missing or invalid
             notes += [f"{settings.calibration_file}{lack}"] if lack else []
+        person = str(settings.more.get("person") or "")
+        if person and not Path(person).expanduser().exists():  # up makes it, replay reads it only
+            raise ReplayError(f"{person}: no such file; body_tracking mesh personalise makes it")
         all_stages = settings.stages()
         # the stages may raise: construct them before `out` is replaced
         first = {each.node: each.make() for each in all_stages if not forked.is_second(each.executable)}

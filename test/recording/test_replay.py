@@ -655,6 +655,13 @@ def test_what_a_calibration_lacks_and_what_no_option_takes_is_named(
     assert code == 2 and "only the sensor kinect1" in reported
 
 
+def test_a_file_of_the_person_that_is_missing_is_an_error(tmp_path: Path, command: Command) -> None:
+    words = ("replay", ROOT / "bags" / "mesh_reaching", "--depth", "kinect1", "--person", tmp_path / "typo.yaml")
+    code, _, reported = command(*words, "-o", tmp_path / "out")
+    assert code == 2 and "typo.yaml: no such file; body_tracking mesh personalise makes it" in reported
+    assert not (tmp_path / "out").exists()
+
+
 def test_errors_have_one_base() -> None:
     for error in (ReplayError, BagError, ParameterError):
         assert issubclass(error, BodyTrackingError)
