@@ -118,7 +118,8 @@ def _topic(node: Listener, topic: str, kinds: Sequence[str], wanted: bool) -> It
             yield Finding(PROBLEM if source else WARNING, found, remedy)
         return
     if len(publishers) > 1 and graph.has_one_publisher(topic):
-        yield Finding(PROBLEM, f"{topic}: {len(publishers)} publishers, {by}", f"end one: ros2 topic info -v {topic}")
+        remedy = f"end all but one of these nodes (where ros2 is there, ros2 topic info -v {topic} says more)"
+        yield Finding(PROBLEM, f"{topic}: {len(publishers)} publishers, {by}", remedy)
     for publisher, reader in product(publishers, readers):
         compatible, reason = qos_check_compatible(publisher.qos_profile, reader.qos_profile)
         if compatible == QoSCompatibility.ERROR:
