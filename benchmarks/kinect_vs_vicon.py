@@ -422,24 +422,25 @@ def law_of(clips: list[Clip]) -> ArmLaw:
 
 
 def correlation_of(clips: list[Clip]) -> float:
-    """Correlation of the errors of a bone's two joints for which both angles' squared errors match the stated variance.
+    """Correlation of the errors of a bone's two joints for which the elbow's squared errors match the stated variance.
 
     The errors are those left by the law in a subject to whom it was not fitted. All subjects have the same weight, and
-    so have all clips of a subject.
+    so have all clips of a subject. The elevation, whose deviation contains the bend of the spine too, does not count.
     """
+    elbow = ANGLES.index("flexion")
     errors, frames = [], []
     for clip in clips:
         law = law_of([each for each in clips if each.subject != clip.subject])
         corrected = [corrected_arms(each, law) for each in clip.skeletons[::_EVERY]]
         frames.append(corrected)
-        errors.append(_positional(corrected, 0.0)[0] - clip.angles[::_EVERY])
+        errors.append((_positional(corrected, 0.0)[0] - clip.angles[::_EVERY])[:, elbow])
     subjects = [each.subject for each in clips]
     weights = 1.0 / np.array([subjects.count(each) for each in subjects])
 
     def excess(of_bones: float) -> float:
-        stated = [_positional(each, of_bones)[1] for each in frames]
-        parts = [np.nanmean(e**2 - np.where(np.isnan(e), e, s**2), axis=0) for e, s in zip(errors, stated, strict=True)]
-        return float((weights @ np.array(parts)).sum())
+        stated = [_positional(each, of_bones)[1][:, elbow] for each in frames]
+        parts = [np.nanmean(e**2 - np.where(np.isnan(e), e, s**2)) for e, s in zip(errors, stated, strict=True)]
+        return float(weights @ np.array(parts))
 
     return float(brentq(excess, 0.0, 0.99, xtol=0.002))
 

@@ -39,9 +39,9 @@ INFERRED_FACTOR = 3.0
 
 BONE_CORRELATION = 0.86
 """Correlation of the errors of the two joints of a bone: a skeleton camera displaces neighbouring joints alike, so that
-bones have better directions than independent joints would give. With this value the stated variances of elevation and
-elbow match the errors of a Kinect v2 against Vicon that remain after the correction of the arms' directions, in people
-to whom the correction was not fitted (``benchmarks/kinect_vs_vicon.py --fit``)."""
+bones have better directions than independent joints would give. With 0.87 the stated variance of the elbow matches the
+errors of a Kinect v2 against Vicon that remain after the correction of the arms' directions, in people to whom the
+correction was not fitted (``benchmarks/kinect_vs_vicon.py --fit``)."""
 
 HEAD_CORRELATION = 0.65
 """The same of head and neck: Kinects v2 show the heads of three people who exercise at constant places between 40 mm to
