@@ -38,9 +38,9 @@ the deflection that gives the direction (the elevation, the elbow flexion) is no
 standard deviations, which noise alone exceeds once in a thousand frames.
 
 The skeleton of a camera has a straight spine: SpineMid lies between its ends, however the person is bent. A Kinect v2
-shows the thorax tilted forward too far by 3 to 13 deg in five people beside Vicon (UI-PRMD; standard deviation 3.7).
-So SpineMid has an error across the thorax, as large as the posture prior (``kinematics.posture``) leaves it where the
-direction of the whole trunk is known. All angles of arms and clavicles, which are against the thorax, contain it.
+shows the thorax tilted forward too far by 3 to 13 deg in five people beside Vicon. So SpineMid has an error across the
+thorax, which all angles of arms and clavicles contain, since they are against the thorax: between upright people as by
+Vicon, more where the trunk is tilted, as the posture prior (``kinematics.posture``) shares a bend.
 
 A person can twist the shoulders against the hips by at most 70 deg. The excess of a larger angle is added to its error.
 
@@ -143,9 +143,9 @@ _TWIST: Final = _ROWS.index("trunk_axial_rotation")
 _MOST_TWIST: Final = math.radians(70.0)
 """Largest twist of shoulders against hips: 50 degrees of the spine (``kinematics.ranges``), the rest of the clavicles.
 Where a sensor swaps left and right of one girdle it is larger for some frames; the excess is an error."""
-_BEND_STDDEV: Final = math.radians(4.0)
-"""Standard deviation of the thorax's direction about the trunk's while that is vertical: 3.7 degrees forwards and 4.4
-sideways by the posture prior."""
+_BEND_STDDEV: Final = math.radians(3.0)
+"""Standard deviation of the thorax's direction about a vertical trunk's: five people beside Vicon (UI-PRMD) have 3.7
+degrees forwards and 1.7 sideways, the posture prior leaves 3.7 and 4.4."""
 _BEND_SHARE: Final = 0.15
 """Share of the trunk's tilt by which the thorax tilts farther: 0.07 forwards, 0.15 sideways by the posture prior."""
 
