@@ -29,10 +29,7 @@ def save(path: Path, shape: FloatArray, covariance: FloatArray) -> None:
         PersonFileError: the file cannot be written.
     """
     content = {"shape": shape.round(6).tolist(), "covariance": covariance.round(8).tolist()}
-    try:
-        files.write_text(path, _HEADER + files.dump_yaml(content, default_flow_style=None))
-    except files.FileError as error:
-        raise PersonFileError(f"{path}: {error}") from error
+    files.write_text(path, _HEADER + files.dump_yaml(content, default_flow_style=None), PersonFileError)
 
 
 def load(path: Path, model: BodyModel) -> tuple[Body, FloatArray]:
@@ -42,8 +39,12 @@ def load(path: Path, model: BodyModel) -> tuple[Body, FloatArray]:
         PersonFileError: the file is missing, is not YAML, or holds no valid shape of this model.
     """
     count = model.vertex_shapes.shape[2]
+    data = files.read_yaml(path, error=PersonFileError)
+    if not isinstance(data, dict) or not {"shape", "covariance"} <= data.keys():
+        raise PersonFileError(
+            f"{path}: expected the keys shape and covariance, as body_tracking mesh personalise writes"
+        )
     try:
-        data = files.read_yaml(path)
         shape, covariance = (np.asarray(data[name], dtype=np.float64) for name in ("shape", "covariance"))
         if covariance.shape != (count, count) or not np.isfinite(covariance).all():
             raise ValueError(
@@ -53,5 +54,5 @@ def load(path: Path, model: BodyModel) -> tuple[Body, FloatArray]:
         if np.linalg.eigvalsh(covariance).min() < -1e-6 or not np.allclose(covariance, covariance.T, atol=1e-6):
             raise ValueError("covariance: not symmetric and positive semidefinite")
         return model.body(shape), covariance
-    except (files.FileError, KeyError, TypeError, ValueError) as error:
+    except (TypeError, ValueError) as error:
         raise PersonFileError(f"{path}: {error}") from error

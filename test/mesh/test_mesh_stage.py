@@ -143,6 +143,9 @@ def test_the_shape_is_estimated_from_different_poses_and_kept_in_a_file(tmp_path
         file.write_text(content)
         with pytest.raises(storage.PersonFileError, match=str(file)):
             made(person=str(file))
+    file.write_text("mapping: {}")
+    with pytest.raises(storage.PersonFileError, match="expected the keys shape and covariance"):
+        made(person=str(file))
 
 
 def test_somebody_else_does_not_get_the_shape_of_who_has_left() -> None:
