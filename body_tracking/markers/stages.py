@@ -260,7 +260,7 @@ class TrackerStage(Stage):
     NAME = "rigid_body_tracker"
     PARAMETERS = (
         SETUP,
-        Parameter("deadline", 0.02, "longest time for one frame; then the search for targets ends", "s", 0.001, 1.0),
+        Parameter("deadline", 0.02, "longest time for one frame; then the search for targets ends", "s", 0.001, 10.0),
         Parameter(
             "tf",
             "targets",

@@ -43,7 +43,7 @@ from body_tracking.pipeline.stage import Stage
 from body_tracking.pipeline.system import load
 from body_tracking.recording import marker_wand
 from body_tracking.recording.progress import Progress
-from body_tracking.recording.replay import ReplaySettings, replay
+from body_tracking.recording.replay import OFFLINE, ReplaySettings, replay
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, check_new_bag
 from body_tracking.systems import NODES
@@ -124,7 +124,7 @@ def points_of(bag_path: Path, folder: Path, diameter: float) -> list[Points]:
 def poses_of(bag_path: Path, folder: Path, diameter: float) -> list[list[TargetPose]]:
     """The poses of the targets in a recording, frame by frame; ``diameter`` of the balls in metres, or 0."""
     stages = (DetectorStage, TriangulationStage, TrackerStage)
-    messages = track(bag_path, folder, stages, {"deadline": 1.0, "diameter": diameter})
+    messages = track(bag_path, folder, stages, {**OFFLINE, "diameter": diameter})
     frames: dict[int, list[TargetPose]] = {}
     for target in load_targets(setup.file_of(folder, setup.TARGETS, "target")):
         for cdr in messages.get(setup.pose_topic(target.name), ()):

@@ -56,8 +56,9 @@ class ReplayError(BodyTrackingError):
     """Raised when the bag lacks the input of the graph."""
 
 
-OFFLINE: Final[Mapping[str, Value]] = {"deadline": 1.0}
-"""Time limits of the stages, seconds: with those of a live graph, offline results would depend on the machine."""
+OFFLINE: Final[Mapping[str, Value]] = {"deadline": 10.0}
+"""Time limits of the stages, seconds: with those of a live graph, offline results would depend on the machine; with
+1 s a busy one lost a frame."""
 
 
 @dataclass(frozen=True, slots=True)
