@@ -33,13 +33,14 @@ from unittest.mock import patch
 import common
 import numpy as np
 from accuracy import TEN, Run, run_ours
+from every_angle import against_truth
 from real_pairs import reversals, skeletons
 
 from body_tracking.core.measurement import left_right_axes
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint
 from body_tracking.core.so3 import wrapped
 from body_tracking.evaluation.metrics import Curve
-from body_tracking.evaluation.reading import AngleSeries, nearest, read
+from body_tracking.evaluation.reading import read
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.fusion import sides
 from body_tracking.fusion.fusion import Fusion
@@ -79,18 +80,6 @@ def _heading(points: FloatArray, pair: tuple[int, int]) -> FloatArray:
     axis = points[:, pair[0]] - points[:, pair[1]]
     heading: FloatArray = np.arctan2(axis[:, 1], axis[:, 0])
     return heading
-
-
-def against_truth(
-    angles: AngleSeries, truth: AngleSeries | None, names: Sequence[str]
-) -> tuple[FloatArray, FloatArray]:
-    """(n, k) errors of angles at stamps with a known truth, and (n, k) their stated standard deviations; radians."""
-    assert truth is not None
-    matches = nearest(truth.stamps_ns, angles.stamps_ns)
-    here = matches >= 0
-    own = [angles.names.index(each) for each in names]
-    true = truth.position[matches[here]][:, [truth.names.index(each) for each in names]]
-    return wrapped(angles.position[here][:, own] - true), angles.stddev[here][:, own]
 
 
 def of_sides(run: Run, name: str) -> dict[str, float]:

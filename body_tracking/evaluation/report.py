@@ -51,7 +51,7 @@ class Column(NamedTuple):
     def text(self, row: int) -> str:
         """The formatted value of a row."""
         value = self.values[row]
-        return "-" if np.isnan(value) else f"{round(value, self.digits) + 0.0:.{self.digits}f}"  # no -0.0
+        return "-" if np.isnan(value) else f"{value:z.{self.digits}f}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -263,7 +263,7 @@ def _facts(result: Evaluation) -> tuple[tuple[str, str], ...]:
     estimate, truth = result.estimate, result.truth
     first, last = result.span
     length = float(truth.stamps_ns[-1] - truth.stamps_ns[0]) / NANOSECONDS
-    delay = f"{round(1e3 * result.delay, 1) + 0.0:.1f} ms of the estimate after the truth"
+    delay = f"{1e3 * result.delay:z.1f} ms of the estimate after the truth"
     rows = [
         ("estimate", f"{estimate.source} {estimate.topic}: {len(estimate.stamps_ns)} frames"),
         ("truth", f"{truth.source} {truth.topic}".rstrip() + f": {len(truth.stamps_ns)} frames"),

@@ -251,7 +251,7 @@ def _rivals(
     apart = np.abs(own.balls - other.balls).max()
     if other is own or apart <= _SAME * (own.balls.max(axis=0) - own.balls.min(axis=0)).max():
         return False
-        # candidates of shared points compare by likelihood; a candidate of other points needs an explanation of its own
+    # candidates of shared points compare by likelihood; a candidate of other points needs an explanation of its own
     shared = len(set(own.assignment) & set(other.assignment) - {-1})
     fewer = other.assignment.count(-1) > own.assignment.count(-1)
     return more < MARGIN or (shared < FEWEST and not fewer and believed(name, other))

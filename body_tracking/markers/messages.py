@@ -30,7 +30,7 @@ MAX_CAMERAS: Final = 32
 POSE: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
 _BALL: Final[Fields] = tuple((name, FLOAT32) for name in ("u", "v", "area", "uu", "uv", "vv"))
 _POINT: Final[Fields] = POSITION + COVARIANCE
-_SINGLE: Final = 2.0**-23
+_SINGLE: Final = float(np.finfo(np.float32).eps)
 """Share of a covariance's trace that exceeds its error in single precision."""
 _INDEX: Final[Fields] = tuple((f"ball{camera}", INT32) for camera in range(MAX_CAMERAS))
 
