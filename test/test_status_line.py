@@ -52,6 +52,9 @@ def test_problems_are_named_by_their_nodes(tmp_path: Path) -> None:
     assert monitor.summary(options, 3.0, {}).endswith(", nothing was recorded")  # the first message makes it
     (tmp_path / "session").mkdir()
     assert monitor.summary(options, 3.0, {}).endswith(f", recorded in {tmp_path / 'session'}")
+    for last, more in (("session", ""), ("session_3", f" to {tmp_path / 'session_3'}")):  # a folder for each round
+        found["bag_recorder"] = NodeStatus("", 0, "", {"messages": "9", "bag": str(tmp_path / last)})
+        assert monitor.summary(options, 3.0, {}).endswith(f", recorded in {tmp_path / 'session'}{more}")
 
 
 def test_messages_that_a_node_did_not_process_are_reported_where_they_are_many() -> None:
@@ -68,7 +71,9 @@ def test_messages_that_a_node_did_not_process_are_reported_where_they_are_many()
     assert losses_part(found) == [text]
     monitor = object.__new__(GraphMonitor)  # without a node
     monitor._statuses, monitor.angles = found, 7
-    assert monitor.summary({"bag": "", "record": None}, 3.0, {}) == f"ran for 3.0 s: 7 frames of joint angles; {text}"
+    assert monitor.summary({"bag": "", "record": None}, 3.0, {}) == (
+        f"ran for 3.0 s: 7 frames of joint angles; {text}; see docs/troubleshooting.md"
+    )
     assert losses_part({"fusion": found["fusion"]}) == []
     assert losses_part({"robot_commands": status(received=20, **{"dropped /joint_states": 2})}) == []  # at the start
 
@@ -153,6 +158,20 @@ def test_a_sensor_that_never_sends_is_named() -> None:
     hint = "nothing comes from /misspelt/skeleton; `body_tracking doctor --sensors misspelt` says more"
     assert hint not in monitor.line(options, 2.0, {})
     assert hint in monitor.line(options, 20.0, {})
+    assert "best-effort" not in monitor.line(options, 20.0, {})
+    reliable = monitor.line({**options, "reliable": True}, 20.0, {})
+    assert f"{hint}; --reliable takes nothing of a best-effort publisher" in reliable
+
+
+def test_a_graph_that_got_malformed_messages_only_says_so_at_its_end() -> None:
+    monitor = object.__new__(GraphMonitor)  # without a node
+    values = {"malformed": "41", "last malformed": "/mine/skeleton: missing field(s) x"}
+    monitor._statuses = {"idle": NodeStatus("", 0, ""), "fusion": NodeStatus("", 0, "no frame", values)}
+    monitor.angles = 0
+    end = "0 frames of joint angles (malformed 41, such as /mine/skeleton: missing field(s) x)"
+    assert monitor.summary({"bag": "", "record": None}, 3.0, {}) == f"ran for 3.0 s: {end}"
+    monitor.angles = 7
+    assert "malformed" not in monitor.summary({"bag": "", "record": None}, 3.0, {})
 
 
 def test_the_recorder_rightly_waits_for_a_bag_that_has_not_begun() -> None:

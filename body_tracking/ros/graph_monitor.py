@@ -101,6 +101,13 @@ def _losses(status: NodeStatus) -> tuple[float, float]:
     return lost, status.number("received") or 0.0
 
 
+def _malformed(statuses: Mapping[str, NodeStatus]) -> tuple[int, str]:
+    """The number of malformed messages that nodes received, and the topic of one of the last with the reason."""
+    numbers = [int(status.values.get("malformed", 0)) for status in statuses.values()]
+    reasons = [status.values.get("last malformed", "") for status in statuses.values()]
+    return sum(numbers), next(filter(None, reasons), "")
+
+
 class GraphMonitor:
     """Subscribes in its own thread.
 
@@ -232,7 +239,7 @@ class GraphMonitor:
             early = starts or elapsed < _SILENT_S
             # the recorder waits for the bag's clock, and the filter may not have started
             parts += problem_parts(fresh, ("bag_recorder",) * starts + ("joint_angles",) * early)
-        malformed = sum(int(status.values.get("malformed", 0)) for status in fresh.values())
+        malformed, _ = _malformed(fresh)
         if malformed:
             parts.append(f"malformed {malformed}")
         parts += losses_part(fresh, self._earlier(now), reliable=bool(options["reliable"]))
@@ -262,7 +269,7 @@ class GraphMonitor:
             return []
         return [
             f"nothing comes from {', '.join(silent.values())}; `body_tracking doctor --sensors {','.join(silent)}` "
-            "says more"
+            "says more" + "; --reliable takes nothing of a best-effort publisher" * bool(options["reliable"])
         ]
 
     def _rates(self, options: Options, fresh: Mapping[str, NodeStatus]) -> str:
@@ -308,18 +315,25 @@ class GraphMonitor:
         elif options["bag"]:
             what = f"stopped before the end of {options['bag']}, after {seconds} (start included)"
         text = f"{what}: {self.angles} frames of joint angles"
-        problems = () if self.angles else problem_parts(self._statuses)
+        problems = [] if self.angles else problem_parts(self._statuses)
+        malformed, reason = _malformed(self._statuses)
+        if malformed and not self.angles:
+            problems.append(f"malformed {malformed}, such as {reason}")
         text += f" ({'; '.join(problems)})" if problems else ""
+        recorder = self._statuses.get("bag_recorder")
+        last = recorder.values.get("bag", "") if recorder is not None and recorder.number("messages") else ""
         if options["record"]:
-            made = Path(str(options["record"])).exists()
-            text += f", recorded in {options['record']}" if made else ", nothing was recorded"
-        elif (recorder := self._statuses.get("bag_recorder")) is not None and recorder.number("messages"):
-            text += f", recorded in {recorder.values.get('bag', '')}"  # by the page or the service
+            first = Path(str(options["record"]))
+            text += f", recorded in {first}" if first.exists() else ", nothing was recorded"
+            if last and Path(last) != first:  # each round of a bag that loops has a folder
+                text += f" to {last}"
+        elif last:
+            text += f", recorded in {last}"  # by the page or the service
         reliable = bool(options.get("reliable"))
         losses = losses_part(self._statuses, reliable=reliable)
         text += "".join(f"; {part}" for part in losses)
-        if losses and options["bag"] and not reliable:
-            text += "; --reliable processes them, later"
+        if losses and not reliable:
+            text += "; --reliable processes them, later" if options["bag"] else "; see docs/troubleshooting.md"
         if restarts:
             text += "; restarts: " + ", ".join(f"{name} {count}" for name, count in restarts.items())
         return text
