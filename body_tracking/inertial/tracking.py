@@ -51,6 +51,12 @@ _AHEAD_OF = 0.85
 nine tenths of the period of 30 Hz, and stamps jitter."""
 _POSE_S, _POSE_EVERY_S = 1.6, 0.25
 """Seconds of readings in which a pose is searched, and seconds between searches."""
+_POSES = {
+    AUTO: "a T-pose with palms down, or arms hanging with thumbs forward,",
+    T_POSE: "a T-pose with palms down",
+    ARMS_DOWN: "arms hanging with thumbs forward",
+}
+"""What the person holds to align the sensors, by the parameter ``pose``."""
 _ASKED_S = 15.0
 """Seconds within which a requested pose must be held."""
 _CAMERA_LASTS = 12.0
@@ -185,8 +191,7 @@ class InertialTracker:
     def align(self) -> str:
         """Align again in the next pose that is held; returns the instruction for the caller."""
         self._asked_until = self._last + _ASKED_S
-        pose = {AUTO: "a T-pose, or arms hanging", T_POSE: "a T-pose", ARMS_DOWN: "arms hanging"}[self.parameters.pose]
-        return f"hold {pose} for four seconds, within the next {_ASKED_S:.0f} s"
+        return f"hold {_POSES[self.parameters.pose]} for four seconds, within the next {_ASKED_S:.0f} s"
 
     @property
     def alignment(self) -> Alignment:
@@ -199,7 +204,7 @@ class InertialTracker:
         Args:
             now_ns: the time in the clock of receipt.
         """
-        lines = []
+        lines, unaligned = [], []
         for stated, sensor in self._sensors.items():
             if sensor.received_ns is None:
                 lines.append(f"{stated}: nothing has come yet")
@@ -214,7 +219,10 @@ class InertialTracker:
             if stated in self._exchanged:
                 lines.append(f"{stated}: its sensor is on {self._exchanged[stated]}")
             if not sensor.problems and self._stddev(sensor) > self.parameters.largest_stddev:
-                lines.append(f"{stated}: not aligned")
+                unaligned.append(stated)
+        if unaligned:
+            pose = _POSES[self.parameters.pose]
+            lines.append(f"{', '.join(unaligned)}: not aligned: the person has to hold {pose} for four seconds")
         lines += [text for stamp, text in self._slips.values() if self._last - stamp < _NAMED_S]
         return tuple(lines)
 
