@@ -117,6 +117,9 @@ def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
     wanted: list[str] = []
     for camera in _cameras(options):
         each = _topics(options, camera)
+        fits = [driver for driver in DRIVERS if DRIVERS[driver].of(camera).colour_info in topics]
+        if fits and each.colour_info not in topics:
+            raise graph.GraphError(f"no topic {each.colour_info}; it has those of --driver {fits[0]}")
         wanted += [each.colour_info, each.depth_info, *images_of(each, str(options["compressed"] or "none"))]
     if options["camera_rig"]:
         for camera in camera_names(Path(str(options["camera_rig"])).expanduser()):

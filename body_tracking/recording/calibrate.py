@@ -28,6 +28,10 @@ from body_tracking.systems import all_nodes_for, nodes_for, options_of
 HISTORY_S = 600.0
 """Seconds of raw frames kept: a recording up to this length is interpolated again with the final clock."""
 
+_ADVICE = (
+    "replay makes skeletons of the images of colour and depth cameras; body_tracking markers calibrates infrared ones"
+)
+
 
 def relative_yaw(result: CalibrationResult, sensor: str) -> float:
     """The rotation about the vertical from a sensor's coordinates to the reference's, in Kinect camera axes.
@@ -65,7 +69,7 @@ def calibrate(
     """
     counters: Counter[str] = Counter()
     with RigReader(bag_path) as bag:
-        topics = sensor_topics(bag, sensors)
+        topics = sensor_topics(bag, sensors, _ADVICE)
         names = tuple(topics.values())
         calibration = OnlineCalibration(names, replace(parameters, history=HISTORY_S), reference or None)
         progress = Progress(bag.start_ns, bag.end_ns)

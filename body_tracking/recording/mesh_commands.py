@@ -45,7 +45,8 @@ def _messages(bag: RigReader, camera: str, *more: str) -> Iterator[tuple[str, by
     topics = (info_topic(camera), depth_topic(camera), *more)
     for topic in topics:
         if topic not in bag.topics:
-            raise MeshCommandError(f"{bag.path}: no topic {topic}; it has {', '.join(sorted(bag.topics))}")
+            made = f", which replay --depth {camera} makes" if topic == mesh_topic(camera) else ""
+            raise MeshCommandError(f"{bag.path}: no topic {topic}{made}; it has {', '.join(sorted(bag.topics))}")
     for raw in bag.messages(topics):
         yield raw.topic, raw.cdr, raw.log_time_ns
 

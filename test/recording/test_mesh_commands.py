@@ -91,6 +91,8 @@ def test_a_recording_without_depth_images_or_with_too_few_poses_says_so(
     out = tmp_path / "person.yaml"
     assert cli.main(["mesh", "personalise", str(ROOT / "bags" / "tpose_wave"), "-o", str(out)]) != 0
     assert "no topic /kinect1/depth/camera_info" in capsys.readouterr().err
+    assert cli.main(["mesh", "show", str(ROOT / "bags" / "mesh_reaching"), "-o", str(tmp_path / "mesh.png")]) != 0
+    assert "no topic /kinect1_mesh/mesh, which replay --depth kinect1 makes; it has" in capsys.readouterr().err
     folder = tmp_path / "empty_room"
     with BagWriter(folder) as bag:
         bag.add_topic(info_topic("kinect1"), CAMERA_INFO, LATCHED)

@@ -346,6 +346,7 @@ def test_a_recording_without_skeletons_is_refused_with_the_options_for_it(tmp_pa
     assert code == 2 and "the option that takes them: --camera-rig FOLDER" in error
     code, _, error = command("calibrate", BAG.with_name("cameras_turning"), "-o", tmp_path / "lab.yaml")
     assert code == 2 and "no topic /<sensor>/skeleton" in error and "--camera" not in error
+    assert "replay makes skeletons of the images of colour and depth cameras; body_tracking markers calibrates" in error
 
 
 def test_a_sensor_that_a_recording_lacks_is_refused_with_those_that_it_has(tmp_path: Path, command: Command) -> None:
@@ -360,6 +361,10 @@ def test_a_sensor_that_a_recording_lacks_is_refused_with_those_that_it_has(tmp_p
         (("replay", BAG, *out, "--imus", "hand_left"), "for hand_left; it has no topic /<segment>/imu/data"),
         (("up", "--bag", BAG, "--imus", "hand_left"), "for hand_left; it has no topic /<segment>/imu/data"),
         (("replay", coloured, *out, "--camera", "cam1"), "/cam1/color/camera_info; it has the cameras camera1"),
+        (
+            ("replay", coloured, *out, "--camera", "camera1", "--driver", "oak"),
+            "no topic /camera1/rgb/camera_info; it has those of --driver plain",
+        ),
         (("replay", coloured, *out, "--camera", "camera1"), "(it comes compressed: --compressed colour)"),
         (("replay", BAG, *out, "--camera", "camera1"), "/camera1/color/camera_info; it has no camera"),
         (
@@ -636,7 +641,8 @@ def test_inertial_sensors_without_a_pose_are_named(tmp_path: Path, command: Comm
     import_files([tmp_path / "a.csv"], tmp_path / "bag", sensors={tmp_path / "a.csv": "forearm_left"})
     words = ("replay", tmp_path / "bag", "-o", tmp_path / "out", "--sensors", "none", "--imus", "forearm_left")
     code, _, reported = command(*words)
-    assert code == 2 and reported.count("\n") == 1 and "(imu_skeleton: forearm_left: not aligned)" in reported
+    assert code == 2 and reported.count("\n") == 1 and "(imu_skeleton: forearm_left: not aligned: " in reported
+    assert "has to hold a T-pose with palms down" in reported
     assert not (tmp_path / "out").exists()
 
 
