@@ -105,6 +105,7 @@ class MeshStage(Stage):
                 *(topic, codec, IMAGES, _KEPT if reliable else 0),
                 droppable=not reliable,
                 perishable=not reliable,
+                optional=topic == self._bodies,
                 foreign=True,
             )
             for topic, codec in ((self._bodies, BodyIndex()), (self._images, DepthImage()))

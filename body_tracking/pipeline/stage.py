@@ -39,7 +39,8 @@ class Port:
         droppable: an input whose oldest messages are dropped where the node is too slow.
         perishable: an input whose messages are dropped if they were sent before a standstill of the process.
         measured: an output whose delay and latency are reported.
-        optional: an output whose message type may not be installed: left out there, and offline.
+        optional: an output whose message type may not be installed: left out there, and offline; an input that the
+            stage does not need.
         absolute: the user chose the name; with a leading slash it holds in every namespace.
         foreign: an input of other packages' publishers: its subscription asks for the strongest quality of service that
             they offer, and for ``qos`` before there are any.

@@ -197,11 +197,11 @@ class StageNode(GraphNode):
         return level, text, {**self.stage.counters, **values}
 
     def _silent_drivers(self) -> list[str]:
-        """The topics of other packages' drivers, of none of which anything has arrived; a bag's are checked before."""
+        """The needed topics of other packages' drivers, if nothing has arrived at all; a bag's are checked before."""
         started = time.monotonic() - self._started > _SILENT_S
         if self.monitor.totals["received"] or not started or self.get_parameter("use_sim_time").value:
             return []
-        return [topic for topic, (port, _) in self.inputs.items() if port.foreign]
+        return [topic for topic, (port, _) in self.inputs.items() if port.foreign and not port.optional]
 
     def close(self) -> None:
         try:

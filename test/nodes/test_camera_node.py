@@ -50,6 +50,7 @@ def test_images_become_skeletons_and_angles_with_deviations(tmp_path: Path) -> N
             marks=pytest.mark.skipif(bool(MISSING), reason=REASON),
         ),
         ("marker_detector", {"setup": str(ROOT / "config" / "marker_setup")}, "/left/image_raw, /right/image_raw"),
+        ("mesh_tracker", {"camera": "kinect1"}, "/kinect1/depth/camera_info, /kinect1/depth/image_raw"),
     ],
 )
 def test_a_driver_that_does_not_run_is_reported_with_the_topics_that_are_missing(
