@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from body_tracking.core.errors import BodyTrackingError, did_you_mean
+from body_tracking.core.files import check_new
 from body_tracking.core.parameters import Value, check_all
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.markers import setup
@@ -180,6 +181,7 @@ def calibrate(args: argparse.Namespace) -> int:
             raise MarkerCommandError(f"camera {name}: no file in {folder}, or no such folder")
         names.append(name)
         series.append([_image(path) for path in files])
+    check_new(args.setup / setup.RIG, overwrite=args.overwrite)
     board = Chessboard(args.columns, args.rows, args.square)
     corners = find_boards(board, series)
     sizes = [(images[0].shape[1], images[0].shape[0]) for images in series]
@@ -360,6 +362,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--columns", type=int, required=True, metavar="N", help="inner corners in a row")
     parser.add_argument("--rows", type=int, required=True, metavar="N", help="rows of inner corners")
     parser.add_argument("--square", type=float, required=True, metavar="METRES", help="width of a square")
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing rig.yaml, also one of a wand")
 
     marker_wand.add_parser(commands)
 

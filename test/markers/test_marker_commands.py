@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from rigs import images, rig
@@ -163,6 +164,22 @@ def test_unusable_recordings_are_refused_in_one_line(
     out = capsys.readouterr()
     assert said.format(folder=tmp_path) in out.err and out.err.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_a_rig_that_a_wand_has_placed_is_not_replaced_without_a_word(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_rig(stereo_rig(), tmp_path / setup.RIG)
+    before = (tmp_path / setup.RIG).read_bytes()
+    (tmp_path / "boards").mkdir()
+    cv2.imwrite(str(tmp_path / "boards" / "0.png"), np.zeros((48, 64), np.uint8))
+    board = ["--camera", f"left={tmp_path / 'boards'}", "--columns", "9", "--rows", "6", "--square", "0.1"]
+    words = ["markers", "calibrate", "--setup", str(tmp_path), *board]
+    assert cli.main(words) == 2
+    assert "rig.yaml: exists already; --overwrite replaces it" in capsys.readouterr().err
+    assert cli.main([*words, "--overwrite"]) == 2
+    assert "exists already" not in capsys.readouterr().err
+    assert (tmp_path / setup.RIG).read_bytes() == before
 
 
 def test_images_without_a_rig_are_refused_with_its_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
