@@ -1,5 +1,6 @@
 """Print the left elbow of the person as a controller would take it: only while it is certain enough."""
 
+import sys
 from contextlib import suppress
 
 import rclpy
@@ -31,6 +32,9 @@ class Elbow(Node):
             print(f"{angles.position[i]:.2f} +- {stddev.position[i]:.2f} rad", flush=True)
 
 
-rclpy.init()
+try:
+    rclpy.init()
+except RuntimeError as error:  # of a ROS_DOMAIN_ID that is no number
+    sys.exit(f"elbow: {error}")
 with suppress(ExternalShutdownException, KeyboardInterrupt):  # kill, Ctrl-C
     rclpy.spin(Elbow())

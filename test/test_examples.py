@@ -13,6 +13,24 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 
 
+@pytest.mark.parametrize("program", [("elbow.py",), ("robot_arms/drive.py", "two_joint_arm")], ids=["elbow", "drive"])
+def test_a_wrong_domain_is_refused_in_one_line(program: tuple[str, ...]) -> None:
+    pytest.importorskip("mujoco" if len(program) > 1 else "rclpy")
+    words = [sys.executable, str(ROOT / "examples" / program[0]), *program[1:]]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "ROS_DOMAIN_ID": "seven"}
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=100)
+    assert done.returncode and "ROS_DOMAIN_ID" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_options_of_a_recording_need_one() -> None:
+    pytest.importorskip("mujoco")
+    words = [sys.executable, str(ROOT / "examples" / "robot_arms" / "drive.py"), "two_joint_arm", "--kill", "6"]
+    done = subprocess.run(
+        words, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=100
+    )
+    assert done.returncode == 2 and "--angles and --kill need --bag" in done.stderr
+
+
 @pytest.mark.slow
 def test_the_notebook_plots_a_recording(tmp_path: Path, wave: Path) -> None:
     """Its cells, run one after the other as a program."""

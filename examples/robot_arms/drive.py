@@ -44,6 +44,7 @@ from body_tracking.pipeline.graph import (
 )
 from body_tracking.recording.rosbag2 import BagReader
 from body_tracking.robot.mapping import TRAJECTORY, RobotMapping, load
+from body_tracking.ros.dds import domain
 
 HERE = Path(__file__).resolve().parent
 ROBOTS = HERE.parents[1] / "config" / "robots"
@@ -300,9 +301,13 @@ def parser() -> argparse.ArgumentParser:
 
 def main() -> int:
     """Run until the bag ends, or Ctrl-C."""
-    args = parser().parse_args()
+    made = parser()
+    args = made.parse_args()
+    if args.bag is None and (args.angles or args.kill is not None):
+        made.error("--angles and --kill need --bag")
     file = ROBOTS / f"{args.robot}.yaml"
     try:
+        domain(os.environ)
         mapping = load(file, {name: angle_names(name) for name in ALL_CONVENTIONS})
     except BodyTrackingError as error:
         print(f"drive: {error}", file=sys.stderr)
@@ -316,6 +321,8 @@ def main() -> int:
     with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
         if args.bag is not None:
             graph = Graph(args.bag, file, "" if args.angles else args.filter)
+        else:
+            print(f"waiting for commands on {mapping.output.topic}, until Ctrl-C", flush=True)
         while graph is None or graph.running():
             executor.spin_once(timeout_sec=0.5)
             if graph is not None and kill is not None and time.monotonic() - node.first > kill:
@@ -325,7 +332,8 @@ def main() -> int:
     executor.shutdown()
     rclpy.try_shutdown(context=context)
     if not node.commands:
-        print(f"no command came: {node.reason}", file=sys.stderr)
+        if not code:  # else the graph has said why
+            print(f"no command came: {node.reason}", file=sys.stderr)
         return code or 1
     print(f"\n{mapping.robot}: {node.commands} commands\n{report(node)}")
     if args.output is not None:
