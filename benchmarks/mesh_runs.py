@@ -64,12 +64,29 @@ class Job(NamedTuple):
 
 
 def runs_of(
-    work: Callable[[Job], _Result], doc: str | None, motions: Sequence[str], *, seeds: int, seconds: float
+    work: Callable[[Job], _Result],
+    doc: str | None,
+    motions: Sequence[str],
+    *,
+    seeds: int,
+    seconds: float,
+    least: float = 0.0,
 ) -> tuple[argparse.Namespace, list[Job], list[_Result]]:
-    """The command line, with these defaults, a job for each of its motions and people, and their results."""
+    """The command line, with these defaults, a job for each of its motions and people, and their results.
+
+    Args:
+        work: of a job.
+        doc: docstring of the benchmark, for its help.
+        motions: default of ``--motions``.
+        seeds: default of ``--seeds``.
+        seconds: default of ``--seconds``.
+        least: seconds of a motion that the benchmark needs.
+    """
     parser = common.parser(doc, seeds=seeds, motions=motions, jobs=True)
     parser.add_argument("--seconds", type=float, default=seconds, help="of each motion (default: %(default)s)")
     arguments = parser.parse_args()
+    if arguments.seconds < least:
+        parser.error(f"--seconds {arguments.seconds:g}: at least {least:g} are needed")
     wheel()
     jobs = [Job(motion, seed, arguments.seconds) for motion in arguments.motions for seed in range(arguments.seeds)]
     return arguments, jobs, common.mapped(work, jobs, arguments.jobs)

@@ -360,6 +360,14 @@ def test_the_table_of_benchmarks_lists_each_of_them(monkeypatch: pytest.MonkeyPa
     assert scripts - {"run", "hosts"} == runner.BENCHMARKS.keys()  # hosts is a command of two_hosts
 
 
+def test_a_benchmark_refuses_motions_in_which_nothing_is_hidden() -> None:
+    words = [sys.executable, str(ROOT / "benchmarks" / "mesh_hidden.py"), "--seconds", "1"]
+    done = subprocess.run(
+        words, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=100
+    )
+    assert done.returncode == 2 and "--seconds 1: at least 1.5 are needed" in done.stderr
+
+
 def test_picture_shows_every_node_and_topic() -> None:
     picture = ElementTree.parse(ROOT / "docs" / "graph.svg").getroot()
     texts = {element.text for element in picture.iter("{http://www.w3.org/2000/svg}text")}
