@@ -35,6 +35,7 @@ from body_tracking.pipeline.roles import ROLES  # noqa: E402
 from body_tracking.pipeline.system import Options  # noqa: E402
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagReader, BagWriter, deserialize  # noqa: E402
 from body_tracking.ros import discovery  # noqa: E402
+from body_tracking.ros.up import options_for  # noqa: E402
 from body_tracking.systems import options_of  # noqa: E402
 from domains import domain  # noqa: E402
 from excerpts import beginning  # noqa: E402
@@ -180,7 +181,22 @@ def test_every_node_may_be_killed_and_tracking_is_back_within_three_seconds(
     assert stamps[-1] - stamps[0] > 0.8 * (last_ns - first_ns)
 
 
-@pytest.mark.parametrize("kept", [True, False])
+@pytest.mark.parametrize("there", [True, False])
+def test_a_calibration_that_is_there_is_only_loaded_while_a_bag_plays(tmp_path: Path, there: bool) -> None:
+    """With the parameter that ``calibration/test_storage.py`` tests."""
+    file = tmp_path / "lab.yaml"
+    parameters = tmp_path / "parameters.yaml"
+    parameters.write_text(f"calibration: {{ros__parameters: {{calibration_file: {file}}}}}")
+    if there:
+        file.write_text("")
+    for named in (("--calibration", file), ("--params-file", parameters)):
+        words = ["up", "--bag", str(BAG), *map(str, named)]
+        specs = systems.nodes_for(options_for(cli.parser("up").parse_args(words)))
+        (calibration,) = (spec.parameters for spec in specs if spec.name == "calibration")
+        assert (calibration.get("save") is False) is there
+
+
+@pytest.mark.parametrize("kept", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_a_bag_writes_a_calibration_only_where_there_was_none(
     up: Callable[..., Up], tmp_path: Path, kept: bool
 ) -> None:

@@ -101,6 +101,19 @@ def test_a_recording_played_beside_changes_no_existing_file(tmp_path: Path, stam
     assert ("room.yaml is not written, as the stamps are those of a recording: 3" in text) is kept
 
 
+def test_a_file_that_is_only_to_be_loaded_is_never_written(tmp_path: Path) -> None:
+    path = tmp_path / "room.yaml"
+    save(example(), path)
+    before = path.read_text()
+    values = {each.name: each.default for each in CalibrationStage.PARAMETERS}
+    stage = CalibrationStage(values | {"calibration_file": str(path), "save": False})
+    assert stage.events == [f"{path}: loaded, not to be written"]
+    stage.calibration.load(example(seed=1))
+    stage._unsaved = True
+    stage.save()
+    assert path.read_text() == before
+
+
 def test_frames_that_waited_during_a_standstill_are_those_of_a_sensor(tmp_path: Path) -> None:
     path = tmp_path / "room.yaml"
     save(example(), path)
