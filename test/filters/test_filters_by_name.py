@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import subprocess
 import sys
-from collections.abc import Iterable
 from dataclasses import fields, replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -98,11 +99,20 @@ FRAMES = [
 """A T-pose of two seconds, which the thesis's extended filter starts from, and from which others learn offsets."""
 
 
-def fed(name: str, frames: Iterable[Skeleton] = (), **parameters: object) -> SkeletonFilter:
-    tested = make_filter(name, **parameters)
-    for each in frames:
-        tested.update(each)
+DISPLACED = np.random.default_rng(1).normal(0.0, 0.01, (N_JOINTS, 3))
+
+
+@cache
+def begun(name: str, learning: bool) -> SkeletonFilter:
+    """A filter after another person, whose joints are elsewhere: offsets that it has learnt may not remain; to copy."""
+    tested = make_filter(name, **settings_of(name, learning))
+    for each in FRAMES:
+        tested.update(replace(each, positions=each.positions + DISPLACED))
     return tested
+
+
+def settings_of(name: str, learning: bool) -> dict[str, bool]:
+    return {} if learning or name not in LINEAR_MODELS else {"t_pose": False}
 
 
 def assert_alike(one: Skeleton | None, other: Skeleton | None) -> None:
@@ -114,7 +124,6 @@ def assert_alike(one: Skeleton | None, other: Skeleton | None) -> None:
         np.testing.assert_array_equal(one.states, other.states)
 
 
-DISPLACED = np.random.default_rng(1).normal(0.0, 0.01, (N_JOINTS, 3))
 ANEW = {"backward_jumps": (-50, "world"), "frame_changes": (2, "map"), "gaps": (50, "world"), "reset": (5, "world")}
 """By counter: seconds by which the frames after such an event are later, and their frame of reference."""
 
@@ -126,10 +135,7 @@ def test_a_restarted_filter_equals_a_new_one(name: str, cause: str) -> None:
     later, frame_id = ANEW[cause]
     # after a gap it is still the same person, whose joints are where a T-pose has shown them
     learning = cause != "gaps"
-    parameters = {} if learning or name not in LINEAR_MODELS else {"t_pose": False}
-    # another person, whose joints are seen elsewhere: nothing of the offsets learnt from this one may remain
-    before = [replace(each, positions=each.positions + DISPLACED) for each in FRAMES]
-    tested, fresh = fed(name, before, **parameters), fed(name, **parameters)
+    tested, fresh = copy.deepcopy(begun(name, learning)), make_filter(name, **settings_of(name, learning))
     assert tested.counters.get("t_poses", 1) == learning
     counted = dict(tested.counters)
     if cause == "reset":
@@ -144,7 +150,7 @@ def test_a_restarted_filter_equals_a_new_one(name: str, cause: str) -> None:
 
 @pytest.mark.parametrize("name", FILTERS)
 def test_repeated_and_late_frames_are_ignored_and_outputs_do_not_change(name: str) -> None:
-    once, twice = fed(name), fed(name)
+    once, twice = make_filter(name), make_filter(name)
     handed_out = []
     for each in FRAMES:
         found = once.update(each)
@@ -162,7 +168,7 @@ def test_repeated_and_late_frames_are_ignored_and_outputs_do_not_change(name: st
 
 @pytest.mark.parametrize("name", FILTERS)
 def test_frames_without_a_joint_give_no_output(name: str) -> None:
-    tested, nowhere = fed(name), np.full((N_JOINTS, 3), np.nan)
+    tested, nowhere = make_filter(name), np.full((N_JOINTS, 3), np.nan)
     for each in FRAMES[:30]:
         assert tested.update(replace(each, positions=nowhere, states=np.zeros_like(TRACKED))) is None
 

@@ -160,7 +160,7 @@ def test_a_magnetic_disturbance_is_named_and_covered(oriented: bool) -> None:
 
 def test_without_a_camera_a_pose_aligns_and_the_drift_is_stated() -> None:
     imus = tuple(sensor(segment) for segment in WORN)
-    fed = feed(recorded("forearm_rolling", imus, 8.0, seed=5), TrackingParameters(camera=False, rate=2.0), seconds=8.0)
+    fed = feed(recorded("forearm_rolling", imus, 8.0, seed=5), TrackingParameters(camera=False, rate=2.0), seconds=5.5)
     assert fed.tracker.counters["alignments by a pose"] == 1
     truth = fed.recording.truths[0]
     # world is where the person faced; the receiver's clock is another than the truth's
