@@ -189,15 +189,30 @@ def calibrate(args: argparse.Namespace) -> int:
     args.setup.mkdir(parents=True, exist_ok=True)
     save_rig(found.rig, args.setup / setup.RIG)
     rms, axes = found.rms(), found.rms_by_axis()
+    seen = [len(np.unique(corners.views[corners.cameras == k])) for k in range(len(names))]
     report = {
         "rig": str(args.setup / setup.RIG),
         "cameras": {
-            name: {"rms_px": float(rms[k]), "rms_x_px": float(axes[k, 0]), "rms_y_px": float(axes[k, 1])}
+            name: {
+                "rms_px": float(rms[k]),
+                "rms_x_px": float(axes[k, 0]),
+                "rms_y_px": float(axes[k, 1]),
+                "boards": seen[k],
+            }
             for k, name in enumerate(names)
         },
         "left_out": [f"view {each.view}, {each.camera or 'all cameras'}: {each.reason}" for each in found.rejected],
     }
-    return _say(args, report, [*table(found).splitlines(), f"written to {report['rig']}"])
+    lines = found_boards(names, seen, len(series[0]))
+    return _say(args, report, [*table(found).splitlines(), *lines, f"written to {report['rig']}"])
+
+
+def found_boards(names: Sequence[str], seen: Sequence[int], images: int) -> list[str]:
+    """In how many of a camera's images a board was found; a warning where they are few, as with a miscounted board."""
+    lines = [f"boards: {', '.join(f'{name} in {n} of {images} images' for name, n in zip(names, seen, strict=True))}"]
+    if 2 * min(seen) <= images:
+        lines.append("warning: few boards were found; columns and rows count the inner corners, not the squares")
+    return lines
 
 
 def target(args: argparse.Namespace) -> int:

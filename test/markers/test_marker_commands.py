@@ -22,6 +22,7 @@ from body_tracking.markers.rig import Rig
 from body_tracking.markers.rig_storage import load_rig, save_rig
 from body_tracking.markers.targets import Target
 from body_tracking.markers.targets_file import load_targets, save_targets
+from body_tracking.recording.marker_commands import found_boards
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagWriter
 from body_tracking.simulation.marker_bags import WAND as RENDERED_WAND
 from body_tracking.simulation.marker_bags import write_wand
@@ -180,6 +181,13 @@ def test_a_rig_that_a_wand_has_placed_is_not_replaced_without_a_word(
     assert cli.main([*words, "--overwrite"]) == 2
     assert "exists already" not in capsys.readouterr().err
     assert (tmp_path / setup.RIG).read_bytes() == before
+
+
+def test_few_boards_are_a_warning() -> None:
+    """Of a board of 9 x 6 corners, 8 x 6 were found in a third of the images, and gave a wrong rig."""
+    assert found_boards(["left", "right"], [12, 7], 12) == ["boards: left in 12 of 12 images, right in 7 of 12 images"]
+    _, warning = found_boards(["left", "right"], [4, 6], 12)
+    assert warning.endswith("columns and rows count the inner corners, not the squares")
 
 
 def test_images_without_a_rig_are_refused_with_its_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
