@@ -89,6 +89,8 @@ def test_a_reliable_graph_names_every_lost_message_and_another_one_names_the_opt
     assert monitor.summary(options, 3.0, {}).endswith(f"298 frames of joint angles; {text}")
     found["kinect1_mesh"].values["lost /kinect1/depth/image_raw"] = "50"
     assert monitor.summary(options | {"reliable": False}, 3.0, {}).endswith("mesh 50; --reliable processes them, later")
+    robot = options | {"reliable": False, "robot": "arm.yaml"}
+    assert monitor.summary(robot, 3.0, {}).endswith("mesh 50; see docs/troubleshooting.md")
 
 
 def monitor_without_node() -> GraphMonitor:

@@ -333,7 +333,8 @@ class GraphMonitor:
         losses = losses_part(self._statuses, reliable=reliable)
         text += "".join(f"; {part}" for part in losses)
         if losses and not reliable:
-            text += "; --reliable processes them, later" if options["bag"] else "; see docs/troubleshooting.md"
+            later = options["bag"] and not options.get("robot")  # which does not follow late angles
+            text += "; --reliable processes them, later" if later else "; see docs/troubleshooting.md"
         if restarts:
             text += "; restarts: " + ", ".join(f"{name} {count}" for name, count in restarts.items())
         return text
