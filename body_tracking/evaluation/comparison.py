@@ -15,8 +15,6 @@ from body_tracking.core.skeleton import (
     BoolArray,
     FloatArray,
     Joint,
-    Skeleton,
-    TrackingState,
 )
 from body_tracking.evaluation.metrics import (
     Alignment,
@@ -39,7 +37,7 @@ from body_tracking.evaluation.metrics import (
     pose_errors,
 )
 from body_tracking.evaluation.reading import AngleSeries, EvaluationError, Recorded, true_angles
-from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
+from body_tracking.kinematics.positional import ANGLE_NAMES, angles_over_time
 
 AS_IT_IS, ALIGNED = "as it is", "aligned"
 MAX_GAP = 0.15
@@ -49,7 +47,6 @@ BEYOND = 0.15
 WINDOW = 0.5
 """Half width of the search for the delay, seconds."""
 
-_TRACKED = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
 _SHOWN = np.broadcast_to(0.01**2 * np.eye(3), (N_JOINTS, 3, 3))
 """True angles that 10 mm of noise in every joint would make unknown, e.g. the plane of a hanging arm, are ignored."""
 _COARSE_RATE, _COARSE_WINDOW = 30.0, 1.5
@@ -343,30 +340,11 @@ def _compare(
 
 def _positional(found: Trajectory, curve: Curve) -> AngleComparison:
     """The angles of both skeletons at the estimate's instants."""
-    mine, stddev = skeleton_angles(found.positions, found.covariances)
+    mine, stddev = angles_over_time(found.positions, found.covariances)
     positions = curve.at(found.times)
-    true, shown = skeleton_angles(positions, np.broadcast_to(_SHOWN, (len(positions), *_SHOWN.shape)))
+    true, shown = angles_over_time(positions, np.broadcast_to(_SHOWN, (len(positions), *_SHOWN.shape)))
     true = np.where(np.isfinite(shown), true, np.nan)
     return AngleComparison(ANGLE_NAMES, found.times, mine, true, stddev, angle_errors(mine, true, stddev))
-
-
-def skeleton_angles(positions: FloatArray, covariances: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
-    """The angles of ``kinematics.positional`` over time.
-
-    Args:
-        positions: (n, 25, 3) metres, z up, NaN where unknown.
-        covariances: (n, 25, 3, 3) square metres; None if not stated.
-
-    Returns:
-        (n, 13) radians, NaN where unknown, and their standard deviations, infinite where unknown.
-    """
-    angles = [
-        positional_angles(
-            Skeleton(0, "", each, _TRACKED, covariances=None if covariances is None else covariances[number])
-        )
-        for number, each in enumerate(positions)
-    ]
-    return np.stack([each.position for each in angles]), np.stack([each.position_stddev for each in angles])
 
 
 def _named(

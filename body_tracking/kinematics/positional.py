@@ -183,6 +183,8 @@ _EYE3 = np.eye(3)
 _TINY = 1e-18
 """Square metres: a smaller squared length counts as zero."""
 _YZX, _ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
+_AT_ONCE: Final = 256
+"""Bodies of which the Jacobians, 8 KB each, are in memory at the same time."""
 _SINGULAR = 1e-6
 """Sine below which a vector lies along the axis that it should turn about."""
 _MAX_STDDEV: FloatArray = np.where(np.arange(_N_ANGLES) < _N_BETWEEN, np.pi / np.sqrt(12.0), np.pi / np.sqrt(3.0))
@@ -202,61 +204,76 @@ _DEFLECTIONS = _deflections()
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Cross product of (3, n) arrays; numpy's own takes three times as long on so few."""
-    return a.take(_YZX, axis=0) * b.take(_ZXY, axis=0) - a.take(_ZXY, axis=0) * b.take(_YZX, axis=0)
+    """Cross product of (..., 3, n) arrays; numpy's own takes three times as long on so few."""
+    return a.take(_YZX, axis=-2) * b.take(_ZXY, axis=-2) - a.take(_ZXY, axis=-2) * b.take(_YZX, axis=-2)
 
 
 def _vectors(positions: FloatArray) -> FloatArray:
-    """(3, 12) the vectors of the table, the heading and the vertical; NaN where a joint is NaN."""
-    vectors = np.empty((3, _N_VECTORS + 2))
-    vectors[:, :_N_VECTORS] = (positions[_TO] - positions[_FROM]).T
-    vectors[:2, _N_VECTORS] = vectors[:2, _HIPS]
-    vectors[2, _N_VECTORS] = 0.0
-    vectors[:, _N_VECTORS + 1] = 0.0, 0.0, 1.0
+    """(..., 3, 12) the vectors of the table, the heading and the vertical; NaN where a joint is NaN."""
+    vectors = np.empty((*positions.shape[:-2], 3, _N_VECTORS + 2))
+    vectors[..., :_N_VECTORS] = (positions[..., _TO, :] - positions[..., _FROM, :]).swapaxes(-1, -2)
+    vectors[..., :2, _N_VECTORS] = vectors[..., :2, _HIPS]
+    vectors[..., 2, _N_VECTORS] = 0.0
+    vectors[..., _N_VECTORS + 1] = 0.0, 0.0, 1.0
     return vectors
 
 
 def _between(
     a: FloatArray, b: FloatArray, aa: FloatArray, bb: FloatArray, ab: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Angles between the columns of two (3, n) arrays, given with their dot products.
+    """Angles between the columns of two (..., 3, n) arrays, given with their dot products.
 
     Returns:
-        (n,) angles from 0 to pi, (n,) their sines, (2, 3, n) gradients by a and b, (2, 3, n) gradients of the
-        deflection across the plane of a and b, by which the angle changes to first order only where it is 0 or pi.
+        (..., n) angles from 0 to pi, (..., n) their sines, (..., 2, 3, n) gradients by a and b, (..., 2, 3, n)
+        gradients of the deflection across the plane of a and b, by which the angle changes to first order only where it
+        is 0 or pi.
     """
     scale = np.sqrt(aa * bb)
     normal = _cross(a, b)
-    area = np.sqrt((normal * normal).sum(axis=0))
+    area = np.sqrt((normal * normal).sum(axis=-2))
     angle, sine = np.arctan2(area, ab), area / scale
-    gradient = np.stack([a * (ab / aa) - b, b * (ab / bb) - a])
+    gradient = np.stack([a * (ab / aa)[..., None, :] - b, b * (ab / bb)[..., None, :] - a], axis=-3)
     flat = sine < _SINGULAR
     if flat.any():  # every direction across a is as good
-        least = np.eye(3)[:, np.abs(a[:, flat]).argmin(axis=0)]
-        normal[:, flat] = _cross(a[:, flat], least)
-        area[flat] = np.sqrt((normal[:, flat] ** 2).sum(axis=0))
-        gradient[0][:, flat] = _cross(a[:, flat], normal[:, flat]) / aa[flat]
-        gradient[1][:, flat] = _cross(normal[:, flat], b[:, flat]) / bb[flat]
-    across = np.stack([normal * (-ab / (scale * np.sqrt(aa))), normal / np.sqrt(bb)])
+        along, other = (np.moveaxis(each, -2, 0)[:, flat] for each in (a, b))
+        least = np.eye(3)[:, np.abs(along).argmin(axis=0)]
+        aside = _cross(along, least)
+        np.moveaxis(normal, -2, 0)[:, flat] = aside
+        area[flat] = np.sqrt((aside**2).sum(axis=0))
+        by_a, by_b = (np.moveaxis(gradient[..., k, :, :], -2, 0) for k in (0, 1))
+        by_a[:, flat] = _cross(along, aside) / aa[flat]
+        by_b[:, flat] = _cross(aside, other) / bb[flat]
+    across = np.stack(
+        [normal * (-ab / (scale * np.sqrt(aa)))[..., None, :], normal / np.sqrt(bb)[..., None, :]], axis=-3
+    )
+    area = area[..., None, None, :]
     return angle, sine, gradient / area, across / area
 
 
 def _dihedral(
     n: FloatArray, p: FloatArray, q: FloatArray, nn: FloatArray, np_: FloatArray, nq: FloatArray, pq: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Angles from p to q about n, columns of (3, m) arrays, given with dot products (Blondel and Karplus 1996).
+    """Angles from p to q about n, columns of (..., 3, m) arrays, given with dot products (Blondel and Karplus 1996).
 
     Returns:
-        (m,) sines and (m,) cosines, scaled alike; (3, 3, m) gradients by n, p and q; (m,) and (m,) the squared areas of
-        (n, p) and (n, q), one of which is 0 where the angle is not defined.
+        (..., m) sines and (..., m) cosines, scaled alike; (..., 3, 3, m) gradients by n, p and q; (..., m) and (..., m)
+        the squared areas of (n, p) and (n, q), one of which is 0 where the angle is not defined.
     """
     length = np.sqrt(nn)
     a, b = _cross(n, p), _cross(n, q)
-    aa, bb = (a * a).sum(axis=0), (b * b).sum(axis=0)
+    aa, bb = (a * a).sum(axis=-2), (b * b).sum(axis=-2)
     # the floor keeps the gradient finite, and huge, at the singularity
-    by_p, by_q = a / np.maximum(aa, _TINY), b / np.maximum(bb, _TINY)
-    gradient = np.stack([by_p * np_ - by_q * nq, by_p * -nn, by_q * nn]) / length
-    return length * (a * q).sum(axis=0), nn * pq - np_ * nq, gradient, aa, bb
+    by_p, by_q = (each / np.maximum(square, _TINY)[..., None, :] for each, square in ((a, aa), (b, bb)))
+    gradient = np.stack(
+        [
+            by_p * np_[..., None, :] - by_q * nq[..., None, :],
+            by_p * -nn[..., None, :],
+            by_q * nn[..., None, :],
+        ],
+        axis=-3,
+    )
+    gradient /= length[..., None, None, :]
+    return length * (a * q).sum(axis=-2), nn * pq - np_ * nq, gradient, aa, bb
 
 
 @lru_cache
@@ -266,16 +283,18 @@ def _correlation(of_bones: float) -> FloatArray:
 
 
 def _roots(covariances: FloatArray) -> FloatArray:
-    """(joints, 3, 3) Cholesky factors; NaN where a covariance is not finite or not positive definite."""
-    known = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))
+    """(..., joints, 3, 3) Cholesky factors; NaN where a covariance is not finite or not positive definite."""
+    known = np.asarray(np.isfinite(covariances).all(axis=(-2, -1)))
     if not known.all():
-        covariances = np.where(known[:, None, None], covariances, _EYE3)
+        covariances = np.where(known[..., None, None], covariances, _EYE3)
     try:
         roots = np.linalg.cholesky(covariances)
     except np.linalg.LinAlgError:  # symmetric roots exist for semidefinite ones, too
+        if covariances.ndim > 3:  # of these bodies only
+            return np.where(known[..., None, None], np.stack([_roots(each) for each in covariances]), np.nan)
         values, axes = np.linalg.eigh(covariances)
         roots = axes * np.sqrt(values)[:, None, :]
-    return np.where(known[:, None, None], roots, np.nan)
+    return np.where(known[..., None, None], roots, np.nan)
 
 
 def positional_angles(skeleton: Skeleton, of_bones: float = BONE_CORRELATION) -> JointAngles:
@@ -295,30 +314,13 @@ def positional_angles(skeleton: Skeleton, of_bones: float = BONE_CORRELATION) ->
     n = _N_ANGLES
     with np.errstate(all="ignore"):  # NaN and infinity mark unknown values
         positions = np.where(skeleton.valid[:, None], skeleton.positions, np.nan)
-        angles, jacobian, sine, singular = _angles_and_jacobian(positions)
-        unknown = np.isnan(angles)
-        unknown[_N_BETWEEN:] |= singular
-        rates, stddev, rate_stddev = np.full(n, np.nan), np.full(n, np.inf), np.full(n, np.inf)
-        if skeleton.covariances is not None:
-            errors = np.where(_USED[:, :, None], jacobian @ _roots(skeleton.covariances[_JOINTS]), 0.0)
-            variances = (errors * errors).sum(axis=2)
-            together = (_correlation(of_bones) @ errors.reshape(len(errors), -1)).reshape(errors.shape)
-            variance = np.maximum((errors * together).sum(axis=(0, 2)), 0.0)
-            by_bend = _bend_variance(positions) * (jacobian[_MIDDLE] ** 2).sum(axis=-1)
-            variance += np.where(_USED[_MIDDLE], by_bend, 0.0)
-            # Near the fold of an angle that cannot be negative the deflection across is an error of its own size, far
-            # from it none; in between it is of second order. With the factor 2 the 95 % band of a straight elbow holds.
-            across = variance[n:]
-            unknown[_N_BETWEEN:] |= _insignificant(angles[:_N_BETWEEN], variance[:_N_BETWEEN])
-            variance[:_N_BETWEEN] += across * np.minimum(1.0, 2.0 * across / sine**2)
-            variance[_TWIST] += max(abs(float(angles[_TWIST])) - _MOST_TWIST, 0.0) ** 2
-            stddev = np.sqrt(variance[:n])
-            unknown |= ~(stddev <= _MAX_STDDEV)
-            stddev[unknown] = np.inf
+        angles, jacobian, stddev, variances = _stated(positions, skeleton.covariances, of_bones)
+        rates, rate_stddev = np.full(n, np.nan), np.full(n, np.inf)
         if skeleton.velocities is not None:
             parts = (jacobian[:, :n] * skeleton.velocities[_JOINTS, None, :]).sum(axis=2)
             rates = np.where(_USED[:, :n], parts, 0.0).sum(axis=0)
-            if skeleton.covariances is not None:
+            if variances is not None:
+                unknown = np.isinf(stddev)
                 steepness = (jacobian[:, :n] ** 2).sum(axis=2)
                 bounds = np.cbrt(_DENSITIES_SQUARED * steepness**2 * variances[:, :n])
                 rate_stddev = np.sqrt(np.where(_USED[:, :n], bounds, 0.0).sum(axis=0))
@@ -328,23 +330,80 @@ def positional_angles(skeleton: Skeleton, of_bones: float = BONE_CORRELATION) ->
     )
 
 
-def _bend_variance(positions: FloatArray) -> float:
-    """Square metres: variance of SpineMid across the thorax by the bend of the spine; NaN where it is unknown."""
-    thorax = positions[_J.SPINE_SHOULDER] - positions[_J.SPINE_MID]
-    tilt = math.atan2(math.hypot(thorax[0], thorax[1]), thorax[2])
-    return (_BEND_STDDEV**2 + (_BEND_SHARE * tilt) ** 2) * float(thorax @ thorax)
+def angles_over_time(positions: FloatArray, covariances: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+    """Positions and standard deviations of :func:`positional_angles` of many bodies at once.
+
+    Args:
+        positions: (n, 25, 3) metres, z up, NaN where unknown.
+        covariances: (n, 25, 3, 3) square metres; None if not stated.
+
+    Returns:
+        (n, 13) radians, NaN where unknown, and their standard deviations, infinite where unknown.
+    """
+    known = np.isfinite(positions).all(axis=-1, keepdims=True)
+    positions = np.where(known, positions, np.nan)
+    angles, stddev = np.empty((2, len(positions), _N_ANGLES))
+    with np.errstate(all="ignore"):
+        for begin in range(0, len(positions), _AT_ONCE):
+            part = slice(begin, begin + _AT_ONCE)
+            stated = None if covariances is None else covariances[part]
+            angles[part], _, stddev[part], _ = _stated(positions[part], stated, BONE_CORRELATION)
+    return angles[:, _ORDER], stddev[:, _ORDER]
+
+
+def _stated(
+    positions: FloatArray, covariances: FloatArray | None, of_bones: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray | None]:
+    """All angles, their Jacobian and standard deviations, in the order of the tables; shapes as for one body.
+
+    Returns:
+        (13,) angles, (joints, 20, 3) their Jacobian as in :func:`_angles_and_jacobian`, (13,) standard deviations, and
+        (joints, 20) the variances that each joint adds; None without covariances.
+    """
+    n = _N_ANGLES
+    angles, jacobian, sine, singular = _angles_and_jacobian(positions)
+    if covariances is None:
+        return angles, jacobian, np.full_like(angles, np.inf), None
+    unknown = np.isnan(angles)
+    unknown[..., _N_BETWEEN:] |= singular
+    errors = np.where(_USED[:, :, None], jacobian @ _roots(covariances[..., _JOINTS, :, :]), 0.0)
+    variances = (errors * errors).sum(axis=-1)
+    flat = errors.reshape(*errors.shape[:-2], -1)
+    together = (_correlation(of_bones) @ flat).reshape(errors.shape)
+    variance = np.maximum((errors * together).sum(axis=(-3, -1)), 0.0)
+    by_bend = np.asarray(_bend_variance(positions))[..., None] * (jacobian[..., _MIDDLE, :, :] ** 2).sum(axis=-1)
+    variance += np.where(_USED[_MIDDLE], by_bend, 0.0)
+    # Near the fold of an angle that cannot be negative the deflection across is an error of its own size, far from it
+    # none; in between it is of second order. With the factor 2 the 95 % band of a straight elbow holds.
+    across = variance[..., n:]
+    unknown[..., _N_BETWEEN:] |= _insignificant(angles[..., :_N_BETWEEN], variance[..., :_N_BETWEEN])
+    variance[..., :_N_BETWEEN] += across * np.minimum(1.0, 2.0 * across / sine**2)
+    variance[..., _TWIST] += np.maximum(np.abs(angles[..., _TWIST]) - _MOST_TWIST, 0.0) ** 2
+    stddev = np.sqrt(variance[..., :n])
+    unknown |= ~(stddev <= _MAX_STDDEV)
+    stddev[unknown] = np.inf
+    return angles, jacobian, stddev, variances
+
+
+def _bend_variance(positions: FloatArray) -> FloatArray:
+    """(...,) square metres: variance of SpineMid across the thorax by the spine's bend; NaN where it is unknown."""
+    thorax = positions[..., _J.SPINE_SHOULDER, :] - positions[..., _J.SPINE_MID, :]
+    tilt = np.arctan2(np.hypot(thorax[..., 0], thorax[..., 1]), thorax[..., 2])
+    variance: FloatArray = (_BEND_STDDEV**2 + (_BEND_SHARE * tilt) ** 2) * (thorax * thorax).sum(axis=-1)
+    return variance
 
 
 def _insignificant(angles: FloatArray, variance: FloatArray) -> BoolArray:
-    """(6,) dihedral angles of which a vector may as well lie along the axis, from the (7,) angles between vectors."""
+    """(..., 6) dihedral angles of which a vector may as well lie along the axis, from the (..., 7) between vectors."""
     between = _B_SIGN * (angles - _B_OFFSET)
     deflection = np.minimum(between, np.pi - between)
-    shown = np.append(deflection > _SIGNIFICANT * np.sqrt(variance), True)  # the last is for -1
-    return np.logical_not(shown[_DEFLECTIONS].all(axis=0))
+    shown = np.ones((*angles.shape[:-1], _N_BETWEEN + 1), dtype=bool)  # the last is for -1
+    shown[..., :-1] = deflection > _SIGNIFICANT * np.sqrt(variance)
+    return np.logical_not(shown[..., _DEFLECTIONS].all(axis=-2))
 
 
 def _angles_and_jacobian(positions: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-    """All angles and their derivatives, in the order of the two tables.
+    """All angles and their derivatives, in the order of the two tables; of several bodies with one more axis in front.
 
     Args:
         positions: (25, 3) metres, NaN where unknown.
@@ -355,38 +414,40 @@ def _angles_and_jacobian(positions: FloatArray) -> tuple[FloatArray, FloatArray,
         about an axis along one of their vectors.
     """
     vectors = _vectors(positions)
-    dots = vectors.T @ vectors
-    squares = dots.diagonal().copy()
+    dots = vectors.swapaxes(-1, -2) @ vectors
+    squares = dots.diagonal(axis1=-2, axis2=-1).copy()
     squares[squares < _TINY] = np.nan  # two joints at one place have no direction
 
     between, sine, gradient, across = _between(
-        vectors[:, _B_A], vectors[:, _B_B], squares[_B_A], squares[_B_B], dots[_B_A, _B_B]
+        *(vectors[..., _B_A], vectors[..., _B_B]),
+        *(squares[..., _B_A], squares[..., _B_B], dots[..., _B_A, _B_B]),
     )
     y, x, turn_gradient, area_p, area_q = _dihedral(
-        vectors[:, _D_AXIS] * _D_AXIS_SIGN,
-        vectors[:, _D_P] * _D_P_SIGN,
-        vectors[:, _D_Q],
-        squares[_D_AXIS],
-        dots[_D_AXIS, _D_P] * (_D_AXIS_SIGN * _D_P_SIGN),
-        dots[_D_AXIS, _D_Q] * _D_AXIS_SIGN,
-        dots[_D_P, _D_Q] * _D_P_SIGN,
+        vectors[..., _D_AXIS] * _D_AXIS_SIGN,
+        vectors[..., _D_P] * _D_P_SIGN,
+        vectors[..., _D_Q],
+        squares[..., _D_AXIS],
+        dots[..., _D_AXIS, _D_P] * (_D_AXIS_SIGN * _D_P_SIGN),
+        dots[..., _D_AXIS, _D_Q] * _D_AXIS_SIGN,
+        dots[..., _D_P, _D_Q] * _D_P_SIGN,
     )
-    smaller = np.minimum(area_p / squares[_D_P], area_q / squares[_D_Q]) / squares[_D_AXIS]
+    smaller = np.minimum(area_p / squares[..., _D_P], area_q / squares[..., _D_Q]) / squares[..., _D_AXIS]
     dihedral = np.where(_D_TURNED, np.arctan2(-x, y), np.arctan2(y, x))  # a quarter turn back
     # propagate the NaN of a vector without length to its angles, which would be finite otherwise
-    angles = np.concatenate([_B_SIGN * between + _B_OFFSET + 0.0 * sine, dihedral + 0.0 * smaller])
+    angles = np.concatenate([_B_SIGN * between + _B_OFFSET + 0.0 * sine, dihedral + 0.0 * smaller], axis=-1)
 
     gradient *= _B_SIGN
-    turn_gradient[0] *= _D_AXIS_SIGN
-    turn_gradient[1] *= _D_P_SIGN
+    turn_gradient[..., 0, :, :] *= _D_AXIS_SIGN
+    turn_gradient[..., 1, :, :] *= _D_P_SIGN
     # the heading is the horizontal part of the hip line
-    gradient[1, 2, _B_HEADING] = across[1, 2, _B_HEADING] = 0.0
-    turn_gradient[0, 2, _D_HEADING] = 0.0
+    gradient[..., 1, 2, _B_HEADING] = across[..., 1, 2, _B_HEADING] = 0.0
+    turn_gradient[..., 0, 2, _D_HEADING] = 0.0
     jacobian = np.concatenate(
         [
-            _B_SLOTS @ gradient.transpose(2, 0, 1),
-            _D_SLOTS @ turn_gradient.transpose(2, 0, 1),
-            _B_SLOTS @ across.transpose(2, 0, 1),
-        ]
+            _B_SLOTS @ np.moveaxis(gradient, -1, -3),
+            _D_SLOTS @ np.moveaxis(turn_gradient, -1, -3),
+            _B_SLOTS @ np.moveaxis(across, -1, -3),
+        ],
+        axis=-3,
     )
-    return angles, jacobian.transpose(1, 0, 2), sine, ~(smaller > _SINGULAR**2)
+    return angles, jacobian.swapaxes(-3, -2), sine, ~(smaller > _SINGULAR**2)

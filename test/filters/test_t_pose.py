@@ -12,7 +12,7 @@ from body_tracking.core.measurement import BASE_STDDEV
 from body_tracking.core.skeleton import FloatArray, Joint, Skeleton
 from body_tracking.filters import SkeletonFilter, make_filter
 from body_tracking.kinematics import positional
-from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
+from body_tracking.kinematics.positional import ANGLE_NAMES, angles_over_time
 from draws import draws, some
 from walkers import TRACKED, frame, performed
 
@@ -59,25 +59,21 @@ def skeletons() -> tuple[Skeleton, ...]:
     return tuple(result)
 
 
-def off(found: Skeleton, true: FloatArray) -> FloatArray:
-    """(13,) radians by which angles are off."""
-    right = positional_angles(Skeleton(found.stamp_ns, "world", true, TRACKED))
-    error: FloatArray = positional_angles(found).position - right.position
-    return error
-
-
 def run(
     tested: SkeletonFilter, frames: range = MOVING, left_out: range = range(0), angles: list[int] = ELBOWS
 ) -> tuple[FloatArray, FloatArray]:
     """Errors of angles in degrees in some frames, and their stated deviations."""
-    errors, stddev = [], []
+    found, right = [], []
     for number, (seen, true) in enumerate(zip(skeletons()[: frames.stop], reaching(), strict=False)):
         out = None if number in left_out else tested.update(seen)
         if out is None or number not in frames:
             continue
-        errors.append(off(out, true)[angles])
-        stddev.append(positional_angles(out).position_stddev[angles])
-    return np.degrees(errors), np.degrees(stddev)
+        found.append(out)
+        right.append(true)
+    covariances = np.stack([each.covariances for each in found])
+    ours, stddev = angles_over_time(np.stack([each.positions for each in found]), covariances)
+    errors = ours - angles_over_time(np.stack(right))[0]
+    return np.degrees(errors[:, angles]), np.degrees(stddev[:, angles])
 
 
 @cache

@@ -19,7 +19,7 @@ from body_tracking.core.measurement import joint_correlation
 from body_tracking.core.skeleton import MIRROR, N_JOINTS, FloatArray, Joint, Skeleton, TrackingState
 from body_tracking.kinematics import positional
 from body_tracking.kinematics.motion import ACCELERATION_DENSITIES, JOINT_CLASSES, joint_densities
-from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
+from body_tracking.kinematics.positional import ANGLE_NAMES, angles_over_time, positional_angles
 from draws import draws
 
 TRACKED = np.full(N_JOINTS, TrackingState.TRACKED, dtype=np.uint8)
@@ -226,14 +226,31 @@ def test_a_straight_elbow_keeps_its_band_and_hides_the_rotation() -> None:
     stddev, count, root = 0.01, 1200, np.linalg.cholesky(joint_correlation())
     pose = t_pose()
     elbow, rotation = (ANGLE_NAMES.index(name) for name in ("elbow_flexion_left", "humeral_rotation_left"))
-    inside = unknown = 0
-    for _ in range(count):
-        errors = stddev * root @ rng.normal(size=pose.shape)
-        angles = positional_angles(skeleton(pose + errors, stddev))
-        inside += angles.position[elbow] < 2 * angles.position_stddev[elbow]
-        unknown += bool(np.isinf(angles.position_stddev[rotation]))
-    assert 0.92 < inside / count < 0.97
-    assert unknown / count > 0.99
+    errors = stddev * root @ rng.normal(size=(count, *pose.shape))
+    covariances = np.broadcast_to(stddev**2 * np.eye(3), (count, N_JOINTS, 3, 3))
+    found, stated = angles_over_time(pose + errors, covariances)
+    assert 0.92 < (found[:, elbow] < 2 * stated[:, elbow]).mean() < 0.97
+    assert np.isinf(stated[:, rotation]).mean() > 0.99
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_angles_of_many_bodies_are_those_of_each(stated: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where joints are unknown or at one place, and covariances unknown, singular or none."""
+    monkeypatch.setattr(positional, "_AT_ONCE", 16)
+    rng = np.random.default_rng(4)
+    positions = np.stack([bent_pose(seed) if seed % 3 else t_pose() for seed in range(40)])
+    positions[rng.random(positions.shape[:2]) < 0.02] = np.nan
+    positions[7, Joint.ELBOW_LEFT] = positions[7, Joint.SHOULDER_LEFT]
+    roots = 0.01 * rng.normal(size=(*positions.shape, 3))
+    covariances = roots @ roots.swapaxes(-1, -2)
+    covariances[8, 4], covariances[10], covariances[11], covariances[12, :, 2] = np.inf, 0.0, -covariances[11], 0.0
+    bodies = [
+        Skeleton(5, "world", each, TRACKED, 0, covariances[k] if stated else None) for k, each in enumerate(positions)
+    ]
+    one_by_one = [positional_angles(each) for each in bodies]
+    at_once = angles_over_time(positions, covariances if stated else None)
+    for name, found in zip(("position", "position_stddev"), at_once, strict=True):
+        assert_allclose(found, [getattr(each, name) for each in one_by_one], rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("twist", [40.0, 60.0, 90.0, 150.0])
