@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv  # scipy.stats takes a command a second to import
 
 from body_tracking.calibration.clock_correlation import correlation_time
 from body_tracking.core.skeleton import BoolArray, FloatArray
@@ -129,7 +129,7 @@ def judge(name: str, parts: Sequence[Differences], *, mountings_known: bool) -> 
     scatter = float(share**2 @ sampling) + (0.0 if poor else by_mounting)
     freedom = max(2.0 * measured**2 / max(scatter, 1e-30), 1.0)
     tail = 0.5 * (1.0 - _LEVEL)
-    low, high = (freedom * measured / chi2.ppf(each, freedom) for each in (1.0 - tail, tail))
+    low, high = (0.5 * freedom * measured / gammaincinv(0.5 * freedom, each) for each in (1.0 - tail, tail))
     low, high = (low, high) if poor else (max(low - reference, 0.0), max(high - reference, 0.0))
     offset, offset_stddev = _offset(parts, share, means, mountings) if mountings_known else (np.nan, np.nan)
     return Judged(
