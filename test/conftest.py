@@ -166,7 +166,15 @@ def replayed_wave(tmp_path_factory: pytest.TempPathFactory, wave: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def extended_wave(tmp_path_factory: pytest.TempPathFactory, wave: Path) -> Path:
+def loaded_ekf() -> None:
+    """The extended filter's compiled code, so that forked processes need not load it, which takes each a second."""
+    from body_tracking.filters.ekf.filter import prepare
+
+    prepare()
+
+
+@pytest.fixture(scope="session")
+def extended_wave(tmp_path_factory: pytest.TempPathFactory, wave: Path, loaded_ekf: None) -> Path:
     """As ``replayed_wave``, with the extended filter."""
     from body_tracking.recording.replay import ReplaySettings, replay
 

@@ -211,6 +211,7 @@ def test_nothing_is_stated_to_be_vaguer_than_the_prior_of_a_pose(extended_wave: 
             assert stddev < vaguest[coordinate], coordinate
 
 
+@pytest.mark.usefixtures("loaded_ekf")
 def test_the_covariance_of_the_model_is_written_where_asked_for_and_nothing_else_changes(
     tmp_path: Path,
 ) -> None:
@@ -238,6 +239,7 @@ def test_every_filter_gives_the_angles_of_a_model(wave: Path, tmp_path: Path, fi
     assert np.isfinite(last.position).all()
 
 
+@pytest.mark.usefixtures("loaded_ekf")
 def test_where_all_sensors_fall_silent_the_extended_filter_predicts(tmp_path: Path) -> None:
     with BagReader(BAG) as bag, BagWriter(tmp_path / "gap") as writer:
         topics = [topic for topic in bag.topics if topic.startswith("/kinect")]
@@ -446,7 +448,7 @@ def test_calibrate_prints_poses_and_clocks(
     ahead = true.rotation[:, 2]
     yaw_deg = np.degrees(np.arctan2(ahead[1], ahead[0]))
     for method in ("thesis", "robust"):
-        code, out, error = command("calibrate", BAG, "--method", method, "--json", "-o", tmp_path / f"{method}.yaml")
+        code, out, error = command("calibrate", wave, "--method", method, "--json", "-o", tmp_path / f"{method}.yaml")
         assert code == 0, error
         result = json.loads(out)
         assert result["reference"] == "kinect1"
@@ -456,9 +458,9 @@ def test_calibrate_prints_poses_and_clocks(
         assert sensor["relative_yaw_deg"] == pytest.approx(yaw_deg, abs=6.0)
         assert sensor["clock_offset_s"] == pytest.approx(offset_s, abs=0.06)
         assert sensor["residual_mm"] < 100.0
-    _, _, error = command("calibrate", BAG, "-o", tmp_path / "robust.yaml")
+    _, _, error = command("calibrate", wave, "-o", tmp_path / "robust.yaml")
     assert "robust.yaml: exists already; --overwrite replaces it" in error
-    code, out, error = command("calibrate", BAG, "-o", tmp_path / "thesis.yaml", "--overwrite")
+    code, out, error = command("calibrate", wave, "-o", tmp_path / "thesis.yaml", "--overwrite")
     assert code == 0, error
     assert "warning" not in out
     assert (tmp_path / "thesis.yaml").read_text() == (tmp_path / "robust.yaml").read_text()
