@@ -56,7 +56,7 @@ def test_absent_targets_are_not_recognised() -> None:
 
 @pytest.mark.parametrize("hidden", [0, 1, 2])
 def test_alone_a_target_is_recognised_by_three_balls(hidden: int) -> None:
-    found, count = 0, 40
+    found, count = 0, draws(20, 40)
     for seed in range(count):
         rng = np.random.default_rng([seed, 23])
         targets = random_targets(rng, 1)
