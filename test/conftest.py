@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
-from hypothesis import settings
 from xdist.scheduler import LoadScopeScheduling
 
 from body_tracking.ros import dds
@@ -25,9 +24,6 @@ if TYPE_CHECKING:
     from body_tracking.messages.base import MessageTypes
 
 ROOT = Path(__file__).resolve().parent.parent
-# one set of examples in `make test`, so that a change is to blame when it fails; others each time in `make test-all`
-settings.register_profile("busy machine", deadline=None, derandomize=not ALL, max_examples=draws(15, 100))
-settings.load_profile("busy machine")
 dds.prepare()  # lost messages of tests are resent as soon as those of nodes
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # a shell without job control ignores SIGINT in background jobs, and every process would inherit that
@@ -54,9 +50,30 @@ def _starts_processes(path: Path) -> bool:
     return path.relative_to(ROOT / "test").parts[0] in PROCESSES
 
 
+def _only_processes(config: pytest.Config) -> bool:
+    expression = _expression(config)
+    return "processes" in expression and "not processes" not in expression
+
+
+def _expression(config: pytest.Config) -> str:
+    return str(config.getoption("markexpr")).replace("slow or not slow", "")  # of test-all
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Examples: one set in `make test`, so that a change is to blame when it fails; others each time in the longer one.
+
+    Tests that start processes draw none, and each of their workers would take a third of a second to import hypothesis.
+    """
+    if not _only_processes(config):
+        from hypothesis import settings
+
+        settings.register_profile("busy machine", deadline=None, derandomize=not ALL, max_examples=draws(15, 100))
+        settings.load_profile("busy machine")
+
+
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Import no file that the marker expression of a phase leaves out as a whole: all of them take 8 s to import."""
-    expression = str(config.getoption("markexpr")).replace("slow or not slow", "")  # of test-all
+    expression = _expression(config)
     if "processes" not in expression or collection_path == ROOT / "test":
         return None
     if collection_path.is_dir():  # with its conftest.py

@@ -14,10 +14,6 @@ from running import Running  # noqa: E402
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # noqa: E402
 
 from body_tracking.core.camera import Camera  # noqa: E402
-from body_tracking.mesh import body_model  # noqa: E402
-from body_tracking.mesh.codecs import BodyIndex, DepthImage  # noqa: E402
-from body_tracking.mesh.raster import render  # noqa: E402
-from body_tracking.mesh.solver import MeshFitter  # noqa: E402
 from body_tracking.mesh.topics import body_index_topic, depth_topic, info_topic, mesh_sensor  # noqa: E402
 from body_tracking.messages import codecs  # noqa: E402
 from body_tracking.messages.skeletons import cloud_to_skeletons  # noqa: E402
@@ -30,6 +26,11 @@ SENSOR_DATA = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 def test_images_and_calibrations_of_a_driver_that_starts_later_and_latches_nothing(tmp_path: Path) -> None:
+    from body_tracking.mesh import body_model  # not by every worker: numba takes half a second
+    from body_tracking.mesh.codecs import BodyIndex, DepthImage
+    from body_tracking.mesh.raster import render
+    from body_tracking.mesh.solver import MeshFitter
+
     body = body_model.load().body()
     standing = body.posed(MeshFitter(body).neutral(np.array([0.0, 0.0, 2.3]), 0.6)).vertices
     seen = render(standing, body.model.faces, CAMERA).depth
