@@ -14,11 +14,12 @@ from numpy.testing import assert_allclose
 from random_people import START_NS, Dropout, MeasurementErrors, RandomPerson, Truth, capture_times, observe, truth_of
 from scipy.linalg import expm
 from scipy.signal import lfilter
-from scipy.stats import binom
+from scipy.stats import binom, norm
 
 from body_tracking.core import so3
 from body_tracking.core.body_model import SEGMENTS
 from body_tracking.core.compiled import LOOPS
+from body_tracking.core.measurement import BASE_STDDEV, joint_correlation
 from body_tracking.core.orientation import SEGMENT_NUMBER, SegmentOrientation
 from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, FloatArray, Joint, Skeleton
 from body_tracking.filters.ekf import orientations
@@ -590,6 +591,47 @@ def test_covariance_holds_under_correlated_errors(spin: float | None) -> None:
         for error, covariance in zip(errors[:, observed], covariances[:, observed][:, :, observed], strict=True):
             normalised.append(error @ np.linalg.solve(covariance, error))
     assert 0.5 < np.mean(normalised) / len(observed) < 1.6, np.mean(normalised) / len(observed)
+
+
+def test_offsets_of_joint_centres_turn_a_measured_segment_less() -> None:
+    """Sensors with the errors that they state on one arm, before a camera whose joint centres are off as it states."""
+    p = EkfParameters(posture=False)
+    root = np.linalg.cholesky(joint_correlation())
+    stated = np.broadcast_to(np.diag([0.03**2] * 3), (N_JOINTS, 3, 3))
+    arm = [
+        NAMES.index(name) for name in ("shoulder_x_left", "shoulder_y_left", "shoulder_z_left", "elbow_flexion_left")
+    ]
+    inside = []
+    people = draws(3, 30)
+    for seed in range(people):
+        rng = np.random.default_rng([seed, 9])
+        person = worn_person(300 + seed, 2.0, 0.004)
+        offsets = BASE_STDDEV[:, None] * (root @ rng.normal(size=(N_JOINTS, 3)))
+        frames = [replace(each, positions=each.positions + offsets, covariances=stated) for each in person.skeletons]
+        sources = [
+            Source(
+                segment,
+                tuple(p.misalignment_stddev * rng.normal(size=3)),
+                p.heading_stddev * rng.normal(),
+                p.tissue_stddev,
+            )
+            for segment in ("upper_arm_left", "forearm_left")
+        ]
+        estimator = ExtendedKalmanFilter(p)
+        feed(estimator, in_order(frames, *(source.measure(person, seed) for source in sources)))
+        estimate, state = known(estimator), estimator._state
+        error = MODEL.difference(estimate.q, person.at(estimate.stamp_ns))
+        inside.append(np.abs(error) < norm.ppf(0.975) * np.sqrt(estimate.covariance.diagonal()[: MODEL.nv]))
+
+        assert state is not None
+        silent = state.sources._but(stamps=state.sources.stamps - NANOSECONDS)
+        by_points, by_both = (estimator._displacement.displaced(each)[0] for each in (state.but(sources=silent), state))
+        turning = estimator._space.model.linearised(state.q, state.lengths).rotation_jacobian[state.sources.segments]
+        for rows in turning:
+            left, whole = (rows @ each[: MODEL.nv, : MODEL.nv] @ rows.T for each in (by_both, by_points))
+            assert 0.0 < np.trace(left) < 0.8 * np.trace(whole), np.trace(left) / np.trace(whole)
+    # the coordinates of a person are not independent: at least as many cover as of `people` that are
+    assert np.mean(inside, axis=0)[arm].mean() >= binom.ppf(0.001, people, 0.95) / people
 
 
 # --- angular velocities

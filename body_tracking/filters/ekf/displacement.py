@@ -14,7 +14,8 @@ from body_tracking.kinematics.compiled_body import Linearised
 
 _DIMENSIONS = 3
 _RECENT_NS = NANOSECONDS // 5
-"""Time before the newest frame in which a sensor's last one must lie for it to count as seeing the person."""
+"""Time before the newest frame in which a sensor's last one must lie for it to count as seeing the person; and before
+the state, in which an orientation must lie."""
 
 
 class Displacement:
@@ -44,9 +45,9 @@ class Displacement:
         innovations of probabilistic data association, Bar-Shalom and Tse 1975).
 
         Constant offsets ``b`` of covariance ``B`` change the best-fitting pose by ``G b`` with
-        ``G = (H^T W H + P^-1)^-1 H^T W``, where ``W`` holds the filter's weights of the points and ``P`` is the prior
-        covariance; the result is ``G B G^T``. This is first order: forearms and hands, hardly longer than the offsets,
-        err by more.
+        ``G = (H^T W H + P^-1)^-1 H^T W``, where ``W`` holds the filter's weights of the points and ``P^-1`` is the
+        information of the prior and of the measured orientations; the result is ``G B G^T``. This is first order:
+        forearms and hands, hardly longer than the offsets, err by more.
         """
         space = self._space
         lines = space.model.linearised(state.q, state.lengths)
@@ -65,8 +66,19 @@ class Displacement:
         else:
             deviations = (scales * np.sqrt(space.base_variance)).repeat(_DIMENSIONS)
             spread = self._correlation * deviations * deviations[:, None]
-        gain = displacing(lines.observation, weights, self._prior_information)
+        gain = displacing(lines.observation, weights, self._prior_information + self._by_orientations(state, lines))
         return gain @ spread @ gain.T, gain @ state.disputed
+
+    def _by_orientations(self, state: State, lines: Linearised) -> FloatArray:
+        """(53, 53) information of the orientations measured lately, whose errors are those before any is learnt."""
+        space, sources = self._space, state.sources
+        information = np.zeros_like(self._prior_information)
+        for number in np.flatnonzero(state.stamp_ns - sources.stamps < _RECENT_NS):
+            misalignment, heading = sources.stated[number]
+            error = sources.slow_variance[number] + np.diag([misalignment, misalignment, misalignment + heading])
+            turning = lines.rotation_jacobian[sources.segments[number]]
+            information[: space.nv, : space.nv] += turning.T @ np.linalg.solve(error, turning)
+        return information
 
     def _factors(self, state: State) -> FloatArray:
         """(19,) factors on the deviations of the offsets, at least 1: how poorly the sensors see each point.
