@@ -36,5 +36,6 @@ try:
     rclpy.init()
 except RuntimeError as error:  # of a ROS_DOMAIN_ID that is no number
     sys.exit(f"elbow: {error}")
+print(f"elbow: waits for {TOPIC} and {TOPIC}_stddev", file=sys.stderr)
 with suppress(ExternalShutdownException, KeyboardInterrupt):  # kill, Ctrl-C
     rclpy.spin(Elbow())

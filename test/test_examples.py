@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from threading import Timer
 
 import pytest
 
@@ -20,6 +21,23 @@ def test_a_wrong_domain_is_refused_in_one_line(program: tuple[str, ...]) -> None
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "ROS_DOMAIN_ID": "seven"}
     done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=100)
     assert done.returncode and "ROS_DOMAIN_ID" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_the_elbow_says_what_it_waits_for() -> None:
+    """Without a graph it would print nothing; on stderr, since stdout has the angles."""
+    pytest.importorskip("rclpy")
+    words = [sys.executable, str(ROOT / "examples" / "elbow.py")]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(words, env=environment, stderr=subprocess.PIPE, text=True) as elbow:
+        assert elbow.stderr
+        killer = Timer(60.0, elbow.kill)
+        killer.start()
+        try:
+            said = elbow.stderr.readline()
+        finally:
+            killer.cancel()
+            elbow.terminate()
+    assert said.startswith("elbow: waits for /humans/bodies/body1/joint_states and ")
 
 
 def test_options_of_a_recording_need_one() -> None:

@@ -73,13 +73,14 @@ def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
     if options["marker_points"]:
         topic = f"/{_foreign(options)[0].lstrip('/')}"
         if topic not in topics:
-            raise graph.GraphError(f"no topic {topic}")
+            raise graph.GraphError(f"no topic {topic}; {graph.listed(topics)}")
         return (topic,)
     sources = setup.sources_in(Path(str(options["marker_setup"])))
     for source in sources:
         if all(topic in topics for topic in source):
             return source
-    raise graph.GraphError(f"no topic {' or '.join(source[0] for source in sources)}")
+    wanted = " or ".join(source[0] for source in sources)
+    raise graph.GraphError(f"no topic {wanted}; {graph.listed(topics)}")
 
 
 SYSTEM = System(

@@ -76,8 +76,8 @@ def _played(options: Options, topics: Collection[str]) -> tuple[str, ...]:
             there = sorted(
                 camera for camera in {each.split("/")[1] for each in topics} if depth_topic(camera) in topics
             )
-            hint = f"; its depth cameras are {', '.join(there)}" if there else ""
-            raise graph.GraphError(f"no topic {topic}{hint}")
+            has = f"its depth cameras are {', '.join(there)}" if there else graph.listed(topics)
+            raise graph.GraphError(f"no topic {topic}; {has}")
     return (*wanted, *(topic for topic in map(body_index_topic, _cameras(options)) if topic in topics))
 
 

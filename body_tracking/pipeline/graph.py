@@ -284,6 +284,11 @@ def check_skeletons(wanted: Iterable[str], topics: Collection[str]) -> None:
             raise GraphError(f"no topic {skeleton_topic(sensor)}; {names}")
 
 
+def listed(topics: Collection[str]) -> str:
+    """What a recording has, for an error that names what it lacks."""
+    return f"it has {', '.join(sorted(topics)) or 'no topics'}"
+
+
 # --- inputs and conventions
 
 AUTO = "auto"

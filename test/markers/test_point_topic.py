@@ -171,5 +171,5 @@ def test_the_option_replaces_the_cameras() -> None:
     for wrong in ({**given, "marker_points": "a:Odometry"}, {"marker_points": "a"}):
         with pytest.raises(graph.GraphError, match="marker points: "):
             systems.nodes_for(systems.options_of(**wrong))
-    with pytest.raises(graph.GraphError, match="no topic /mocap/points"):
+    with pytest.raises(graph.GraphError, match="no topic /mocap/points; it has /other"):
         systems.played(options, ["/other"])

@@ -352,10 +352,12 @@ def test_a_recording_without_skeletons_is_refused_with_the_options_for_it(tmp_pa
 
 
 def test_a_sensor_that_a_recording_lacks_is_refused_with_those_that_it_has(tmp_path: Path, command: Command) -> None:
-    """Not with all its topics; an inertial sensor in the form of the option ``--imus``."""
+    """All its topics only where it has no such sensor; an inertial sensor in the form of the option ``--imus``."""
     five, coloured, out = BAG.with_name("five_systems"), BAG.with_name("camera_reaching"), ("-o", tmp_path / "out")
     turning = BAG.with_name("cameras_turning")
     worn = "forearm_left, forearm_right, pelvis, upper_arm_left, upper_arm_right, upper_trunk"
+    with BagReader(BAG) as reader:
+        listed = ", ".join(sorted(reader.topics))
     for words, said in (
         (("replay", five, *out, "--sensors", "kinect1,kinect9"), "kinect9/skeleton; its sensors are kinect1, kinect2"),
         (("calibrate", five, "--sensors", "kinect9"), "/kinect9/skeleton; its sensors are kinect1, kinect2"),
@@ -374,6 +376,11 @@ def test_a_sensor_that_a_recording_lacks_is_refused_with_those_that_it_has(tmp_p
             "/camera1/color/camera_info; of camera1 it has /camera1/color/image_raw/compressed",
         ),
         (("replay", five, *out, "--depth", "camera9"), "camera_info; its depth cameras are camera1, kinect1"),
+        (("replay", BAG, *out, "--depth", "kinect1"), f"no topic /kinect1/depth/camera_info; it has {listed}"),
+        (
+            ("replay", BAG, *out, "--marker-setup", BAG.parents[1] / "config" / "marker_setup"),
+            f"no topic /left/image_raw or /left/balls or /markers/points; it has {listed}",
+        ),
         (("replay", five, *out, "--imus", "pelvis,hand_left"), f"for hand_left; its inertial sensors are {worn}"),
     ):
         code, _, error = command(*words)

@@ -20,6 +20,7 @@ public:
   Elbow() : Node("elbow")
   {
     const std::string topic = "/humans/bodies/body1/joint_states";
+    std::fprintf(stderr, "elbow: waits for %s and %s_stddev\n", topic.c_str(), topic.c_str());
     angles_subscription_ = create_subscription<JointState>(
       topic, 10, [this](const JointState::ConstSharedPtr message) {on_angles(message);});
     stddev_subscription_ = create_subscription<JointState>(
