@@ -162,7 +162,7 @@ def test_a_sensor_that_never_sends_is_named() -> None:
     assert hint in monitor.line(options, 20.0, {})
     assert "best-effort" not in monitor.line(options, 20.0, {})
     reliable = monitor.line({**options, "reliable": True}, 20.0, {})
-    assert f"{hint}; --reliable takes nothing of a best-effort publisher" in reliable
+    assert hint in reliable and "best-effort" not in reliable
 
 
 def test_a_graph_that_got_malformed_messages_only_says_so_at_its_end() -> None:

@@ -69,6 +69,14 @@ def result_qos(values: Mapping[str, Value]) -> Qos:
 
 
 def skeleton_input(topic: str, values: Mapping[str, Value]) -> Port:
-    """The port of a skeleton topic that a stage takes."""
+    """The port of a skeleton topic that a stage takes.
+
+    A sensor of another package may publish best effort, of which a reliable subscription would receive nothing.
+    """
     best_effort = not values["reliable"]
-    return Port(topic, Skeletons(), skeleton_qos(values), FRAMES_KEPT, droppable=best_effort, perishable=best_effort)
+    return Port(
+        *(topic, Skeletons(), skeleton_qos(values), FRAMES_KEPT),
+        droppable=best_effort,
+        perishable=best_effort,
+        foreign=not best_effort and bool(graph.sensors_among((topic,))),
+    )

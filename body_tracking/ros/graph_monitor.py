@@ -269,7 +269,7 @@ class GraphMonitor:
             return []
         return [
             f"nothing comes from {', '.join(silent.values())}; `body_tracking doctor --sensors {','.join(silent)}` "
-            "says more" + "; --reliable takes nothing of a best-effort publisher" * bool(options["reliable"])
+            "says more"
         ]
 
     def _rates(self, options: Options, fresh: Mapping[str, NodeStatus]) -> str:

@@ -399,7 +399,10 @@ class GraphNode(BatchNode):
         return self.create_subscription(kind, topic if absolute else names.relative(topic), checked, qos, raw=raw)
 
     def subscribe_to_skeletons(self, topic: str, handle: Callable[[tuple[Skeleton, ...], int], None]) -> Subscription:
-        """Subscribe to a skeleton topic; a backward jump of its stamps calls :meth:`time_jumped_back` first."""
+        """Subscribe to a skeleton topic; a backward jump of its stamps calls :meth:`time_jumped_back` first.
+
+        Best effort also with ``reliable``, since a sensor of another package may publish so.
+        """
         name, port = self.full_name(topic), skeleton_input(topic, self.values)
 
         def convert(cdr: bytes, sent_ns: int) -> None:
@@ -411,7 +414,7 @@ class GraphNode(BatchNode):
                 self.time_jumped_back(topic)
             handle(skeletons, sent_ns)
 
-        qos = replace(port.qos, depth=max(port.qos.depth, port.waiting))
+        qos = replace(SENSOR_DATA, depth=max(port.qos.depth, port.waiting))
         return self.subscribe_port(port, qos, PointCloud2, convert)
 
     def subscribe_port(self, port: Port, qos: Qos, kind: type[Any], handle: Callable[[Any, int], None]) -> Subscription:

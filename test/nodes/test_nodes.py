@@ -17,6 +17,7 @@ import pytest
 rclpy = pytest.importorskip("rclpy", reason="ROS is not installed")
 
 from geometry_msgs.msg import TransformStamped  # noqa: E402
+from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
 from running import BAG, LATCHED, RELIABLE, Running, environment, recorded, refusal, stop  # noqa: E402
 from sensor_msgs.msg import JointState, PointCloud2, TimeReference  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
@@ -444,3 +445,25 @@ def test_calibration_is_saved_and_loaded(tmp_path: Path) -> None:
         loaded = {pose.child_frame_id: pose.transform.translation for pose in poses}
         assert loaded["kinect2_optical_frame"].x == pytest.approx(result.poses["kinect2"].translation[0])
         assert clocks[0].source == "kinect2"
+
+
+def test_a_reliable_graph_takes_a_sensor_that_publishes_best_effort(tmp_path: Path) -> None:
+    """``up --reliable --external``: a sensor of another package, which starts after the nodes."""
+    readers: dict[str, dict[str, object]] = {
+        "fusion": {},
+        "calibration": {},
+        "robot_commands": {"mapping": BAG.parents[1] / "config" / "robots" / "two_joint_arm.yaml"},
+    }
+    frame = recorded("kinect1")[0]
+    with Running(tmp_path) as running:
+        for name, more in readers.items():
+            running.start(name, reliable=True, sensors="[kinect1, kinect2]", **more)
+        assert running.until(lambda: readers.keys() <= running.diagnostics.keys(), 60.0)
+        best_effort = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+        sensor = running.node.create_publisher(PointCloud2, graph.skeleton_topic("kinect1"), best_effort)
+
+        def publish() -> bool:
+            sensor.publish(skeletons_to_cloud([replace(frame, stamp_ns=time.time_ns())], ROS))
+            return all("rate in /kinect1/skeleton" in running.said(name) for name in readers)
+
+        assert running.until(publish, 30.0)
