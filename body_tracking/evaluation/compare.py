@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 
 from body_tracking.core import files
+from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.evaluation.estimated_segments import EstimatedSegments, read_segments, read_true_segments
 from body_tracking.evaluation.hand_eye import MAX_GAP
@@ -26,6 +27,7 @@ from body_tracking.evaluation.report import Column, Report, Table
 from body_tracking.pipeline import graph
 from body_tracking.recording import replay
 from body_tracking.recording.rig import RigReader
+from body_tracking.recording.rosbag2 import BagReader, check_new_bag
 
 TRUTH: Final = "truth"
 Side = EstimatedSegments | MarkerReference
@@ -202,14 +204,14 @@ def replay_systems(bag: Path, systems: Mapping[str, list[str]], output: Path, *,
     """Replay a recording once with each system, each into a folder of its name.
 
     Raises:
-        EvaluationError: arguments that replay does not accept.
+        EvaluationError: arguments that replay does not accept, or what they name is missing.
         BodyTrackingError: as replay.
     """
     parser = argparse.ArgumentParser(exit_on_error=False)
     replay.add_parser(parser.add_subparsers())
     options = ["--overwrite"] if overwrite else []
     parsed = {}
-    for name, arguments in systems.items():  # check all arguments before the first replay
+    for name, arguments in systems.items():  # check all before the first replay, which takes long
         try:
             given = ["replay", str(bag), "-o", str(output / name), *options, *arguments]
             parsed[name], unknown = parser.parse_known_args(given)
@@ -217,6 +219,13 @@ def replay_systems(bag: Path, systems: Mapping[str, list[str]], output: Path, *,
             raise EvaluationError(f"{name}: {error}") from error
         if unknown:
             raise EvaluationError(f"{name}: replay does not take {' '.join(unknown)}")
+    with BagReader(bag) as reader:
+        for name, args in parsed.items():
+            check_new_bag(args.output, overwrite=overwrite)
+            try:
+                replay.inputs(replay.settings_from(args), reader)
+            except BodyTrackingError as error:
+                raise EvaluationError(f"{name}: {error}") from error
     for name, args in parsed.items():
         print(f"{name}: replay {' '.join(systems[name])}", file=sys.stderr)
         with contextlib.redirect_stdout(sys.stderr):

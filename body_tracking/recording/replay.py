@@ -182,6 +182,22 @@ def sensor_topics(bag: BagReader, wanted: Sequence[str] = (), advice: str = "") 
     return {graph.skeleton_topic(name): name for name in names}
 
 
+def inputs(settings: ReplaySettings, bag: BagReader) -> tuple[ReplaySettings, dict[str, str], tuple[str, ...]]:
+    """The settings with the sensors of a bag, these as of :func:`sensor_topics`, and the topics of all other inputs.
+
+    Raises:
+        ReplayError: the bag lacks an input.
+        BodyTrackingError: a folder that the settings name is missing or invalid.
+    """
+    advice = advice_for({name: each.type_name for name, each in bag.topics.items()})
+    topics = {} if _without(settings, bag) else sensor_topics(bag, settings.sensors, advice)
+    settings = replace(settings, sensors=tuple(topics.values()))
+    try:
+        return settings, topics, played(settings.options(), bag.topics)
+    except graph.GraphError as error:
+        raise ReplayError(f"{bag.path}: {error}") from error
+
+
 def skeletons_of(
     bag: BagReader, topics: Mapping[str, str], counters: Counter[str]
 ) -> Iterator[tuple[str, Skeleton, int, bytes]]:
@@ -228,14 +244,8 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
     if bag_path.resolve() in (out.resolve(), *out.resolve().glob("*.mcap")):
         raise ReplayError(f"{out}: is the recording itself; give another folder")
     with RigReader(bag_path) as bag:
-        advice = advice_for({name: each.type_name for name, each in bag.topics.items()})
-        topics = {} if _without(settings, bag) else sensor_topics(bag, settings.sensors, advice)
-        settings = replace(settings, sensors=tuple(topics.values()))
+        settings, topics, sources = inputs(settings, bag)
         truth = [topic for topic in bag.topics if topic.startswith("/ground_truth/")]
-        try:
-            sources = played(settings.options(), bag.topics)
-        except graph.GraphError as error:
-            raise ReplayError(f"{bag_path}: {error}") from error
         settings = replace(settings, more={**settings.more, "played": sources})
         others = unused({name: each.type_name for name, each in bag.topics.items()}, settings.options())
         kept = tuple(dict.fromkeys((*topics, *truth, *sources)))

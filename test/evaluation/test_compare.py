@@ -146,6 +146,7 @@ def test_another_estimate_is_a_reference_that_errs_itself(
         (["{one}", "--systems", "{yaml}", "-o", "{one}_out"], "expected a name and a list of arguments"),
         (["{one}", "--systems", "{one}.yaml", "-o", "{one}_out"], "one.yaml"),
         (["{one}", "--systems", "{other}", "-o", "{one}_out"], "kinects: replay does not take --bogus"),
+        (["{one}", "--systems", "{lack}", "-o", "{one}_out"], "markers: nowhere: no such folder"),
     ],
 )
 def test_wrong_arguments_are_reported_in_one_line(
@@ -153,7 +154,10 @@ def test_wrong_arguments_are_reported_in_one_line(
 ) -> None:
     (folder / "bad.yaml").write_text("kinects: ekf\n")
     (folder / "other.yaml").write_text("kinects: [--filter, ekf, --bogus]\n")
+    # refused before the first replay, which would print its arguments
+    (folder / "lack.yaml").write_text("markers: [--sensors, none, --marker-setup, nowhere]\n")
     names = {"one": folder / "one", "yaml": folder / "bad.yaml", "other": folder / "other.yaml"}
+    names["lack"] = folder / "lack.yaml"
     assert main(["compare", *(each.format(**names) for each in arguments)]) == 2
     reported = capsys.readouterr().err
     assert message in reported and reported.count("\n") == 1
