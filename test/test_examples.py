@@ -49,6 +49,16 @@ def test_options_of_a_recording_need_one() -> None:
     assert done.returncode == 2 and "--angles and --kill need --bag" in done.stderr
 
 
+def test_angles_of_a_missing_recording_are_refused_in_one_line(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    drive, bag = ROOT / "examples" / "robot_arms" / "drive.py", tmp_path / "missing"
+    words = [sys.executable, str(drive), "two_joint_arm", "--bag", str(bag), "--angles"]
+    done = subprocess.run(
+        words, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=100
+    )
+    assert done.returncode == 2 and done.stderr == f"drive: {bag}: no such recording\n"
+
+
 @pytest.mark.slow
 def test_the_notebook_plots_a_recording(tmp_path: Path, wave: Path) -> None:
     """Its cells, run one after the other as a program."""

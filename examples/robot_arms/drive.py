@@ -309,6 +309,8 @@ def main() -> int:
     try:
         domain(os.environ)
         mapping = load(file, {name: angle_names(name) for name in ALL_CONVENTIONS})
+        if args.angles:  # another bag is refused by the graph
+            BagReader(args.bag).close()
     except BodyTrackingError as error:
         print(f"drive: {error}", file=sys.stderr)
         return 2
