@@ -379,7 +379,6 @@ def following(log: str) -> list[tuple[float, float]]:
     return list(itertools.zip_longest(begun, ended, fillvalue=np.inf))
 
 
-@pytest.mark.slow  # robot/test_simulated_arms.py follows the same angles without processes
 @pytest.mark.alone
 def test_an_arm_follows_two_sensors_through_the_whole_graph_and_holds_when_they_die(tmp_path: Path) -> None:
     with Robots(tmp_path, "two_joint_arm") as robots:

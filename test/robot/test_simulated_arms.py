@@ -11,17 +11,9 @@ from hypothesis import strategies as st
 from simulated_arm import SimulatedArm
 
 from body_tracking.core import so3
-from body_tracking.core.message_types import JOINT_STATE
-from body_tracking.core.skeleton import NANOSECONDS
 from body_tracking.kinematics.conventions import ALL_CONVENTIONS, angle_names, angles_of
 from body_tracking.kinematics.stage import state_estimate
 from body_tracking.kinematics.upper_body import UpperBody
-from body_tracking.messages.angles import joint_states_to_angles
-from body_tracking.pipeline import graph
-from body_tracking.recording.replay import ReplaySettings, replay
-from body_tracking.recording.rosbag2 import BagReader, deserialize
-from body_tracking.robot.calibration import CalibrationQuality
-from body_tracking.robot.follower import Follower, State
 from body_tracking.robot.mapping import RobotMapping, load
 from draws import draws
 
@@ -112,55 +104,3 @@ def test_a_point_is_reached_in_the_stated_time_and_not_before() -> None:
     np.testing.assert_allclose(arm.set_point, mapping.home + 0.1, atol=1e-9)
     arm.advance(0.06)
     np.testing.assert_allclose(arm.set_point, goal, atol=1e-9)
-
-
-def test_a_robot_follows_the_angles_of_the_graph_and_holds_when_its_sensors_fall_silent(
-    wave: Path, tmp_path: Path
-) -> None:
-    """As ``up --robot`` does it; each command lies between the angles of a tenth of a second before and after it."""
-    replay(wave, tmp_path / "out", ReplaySettings(convention="isb"))
-    mapping, _ = arm_of("two_joint_arm")
-    follower, period_ns = Follower(mapping, 0.01), NANOSECONDS // 100
-    follower.watch_sensors(("kinect1", "kinect2"))
-    topics = graph.joint_states_topic("body1"), graph.joint_states_stddev_topic("body1")
-    sensors = {graph.skeleton_topic(name): name for name in ("kinect1", "kinect2")}
-    with BagReader(tmp_path / "out") as bag:
-        messages = list(bag.messages([*topics, *sensors]))
-    now_ns, pair = messages[0].log_time_ns, {}
-    commands: list[tuple[int, np.ndarray]] = []
-    angles: list[tuple[int, np.ndarray]] = []
-    stands = mapping.home
-    for raw in messages:
-        while now_ns < raw.log_time_ns:
-            follower.calibration.receive_quality(CalibrationQuality((), 0.01, 0.01), now_ns)
-            follower.receive_robot_state(mapping.joints, stands, now_ns)
-            command = follower.step(now_ns, now_ns)
-            stands = stands if command.position is None else command.position
-            if command.state == State.FOLLOWING:
-                commands.append((now_ns, stands))
-            now_ns += period_ns
-        if raw.topic in sensors:
-            follower.receive_frame(sensors[raw.topic], raw.log_time_ns, now_ns)
-            continue
-        pair[raw.topic] = deserialize(JOINT_STATE, raw.cdr)
-        if len(pair) == 2:
-            values, deviations = (pair.pop(topic) for topic in topics)
-            found = joint_states_to_angles(values, deviations, "body1")
-            follower.receive_angles(found, values.header.frame_id, now_ns, now_ns)
-            columns = [found.names.index(name) for name in mapping.angles]
-            angles.append((now_ns, mapping.matrix @ found.position[columns] + mapping.offset))
-    at, commanded = (np.array(each) for each in zip(*commands, strict=True))
-    came, asked = (np.array(each) for each in zip(*angles, strict=True))
-    assert len(commanded) > 150 and np.ptp(commanded[:, 1]) > np.radians(40.0)
-    shifted = np.array(
-        [
-            np.stack([np.interp(at + k * period_ns, came, column) for column in asked.T], axis=1)
-            for k in range(-10, 11, 2)
-        ]
-    )
-    off = np.degrees(np.maximum(commanded - shifted.max(axis=0), shifted.min(axis=0) - commanded)).max(axis=1)
-    assert np.quantile(off, 0.9) < 5.0
-    for _ in range(10):
-        now_ns += period_ns
-        command = follower.step(now_ns, now_ns)
-    assert command.state == State.HOLDING and "no new angles" in command.reason
