@@ -593,36 +593,45 @@ def test_covariance_holds_under_correlated_errors(spin: float | None) -> None:
     assert 0.5 < np.mean(normalised) / len(observed) < 1.6, np.mean(normalised) / len(observed)
 
 
-def test_offsets_of_joint_centres_turn_a_measured_segment_less() -> None:
-    """Sensors with the errors that they state on one arm, before a camera whose joint centres are off as it states."""
-    p = EkfParameters(posture=False)
-    root = np.linalg.cholesky(joint_correlation())
+DISPLACED = EkfParameters(posture=False)
+
+
+def displaced(seed: int, segments: Sequence[str]) -> tuple[ExtendedKalmanFilter, FloatArray]:
+    """The filter of a person whose joint centres are off as the camera states, and the true (35,) configuration.
+
+    The sensors on the segments have the errors that they state.
+    """
+    rng = np.random.default_rng([seed, 9])
+    person = worn_person(300 + seed, 2.0, 0.004)
+    offsets = BASE_STDDEV[:, None] * (np.linalg.cholesky(joint_correlation()) @ rng.normal(size=(N_JOINTS, 3)))
     stated = np.broadcast_to(np.diag([0.03**2] * 3), (N_JOINTS, 3, 3))
+    frames = [replace(each, positions=each.positions + offsets, covariances=stated) for each in person.skeletons]
+    p = DISPLACED
+    sources = [
+        Source(
+            segment,
+            tuple(p.misalignment_stddev * rng.normal(size=3)),
+            p.heading_stddev * rng.normal(),
+            p.tissue_stddev,
+        )
+        for segment in segments
+    ]
+    estimator = ExtendedKalmanFilter(p)
+    feed(estimator, in_order(frames, *(source.measure(person, seed) for source in sources)))
+    return estimator, person.at(known(estimator).stamp_ns)
+
+
+def test_offsets_of_joint_centres_turn_a_measured_segment_less() -> None:
     arm = [
         NAMES.index(name) for name in ("shoulder_x_left", "shoulder_y_left", "shoulder_z_left", "elbow_flexion_left")
     ]
     inside = []
     people = draws(3, 30)
     for seed in range(people):
-        rng = np.random.default_rng([seed, 9])
-        person = worn_person(300 + seed, 2.0, 0.004)
-        offsets = BASE_STDDEV[:, None] * (root @ rng.normal(size=(N_JOINTS, 3)))
-        frames = [replace(each, positions=each.positions + offsets, covariances=stated) for each in person.skeletons]
-        sources = [
-            Source(
-                segment,
-                tuple(p.misalignment_stddev * rng.normal(size=3)),
-                p.heading_stddev * rng.normal(),
-                p.tissue_stddev,
-            )
-            for segment in ("upper_arm_left", "forearm_left")
-        ]
-        estimator = ExtendedKalmanFilter(p)
-        feed(estimator, in_order(frames, *(source.measure(person, seed) for source in sources)))
+        estimator, true = displaced(seed, ("upper_arm_left", "forearm_left"))
         estimate, state = known(estimator), estimator._state
-        error = MODEL.difference(estimate.q, person.at(estimate.stamp_ns))
+        error = MODEL.difference(estimate.q, true)
         inside.append(np.abs(error) < norm.ppf(0.975) * np.sqrt(estimate.covariance.diagonal()[: MODEL.nv]))
-
         assert state is not None
         silent = state.sources._but(stamps=state.sources.stamps - NANOSECONDS)
         by_points, by_both = (estimator._displacement.displaced(each)[0] for each in (state.but(sources=silent), state))
@@ -632,6 +641,19 @@ def test_offsets_of_joint_centres_turn_a_measured_segment_less() -> None:
             assert 0.0 < np.trace(left) < 0.8 * np.trace(whole), np.trace(left) / np.trace(whole)
     # the coordinates of a person are not independent: at least as many cover as of `people` that are
     assert np.mean(inside, axis=0)[arm].mean() >= binom.ppf(0.001, people, 0.95) / people
+
+
+def test_sensors_on_the_trunk_leave_the_arms_as_known_as_a_camera_alone() -> None:
+    """Their deviations were more than twice those without any sensor."""
+    arms = [k for k, name in enumerate(NAMES) if name.startswith(("shoulder", "elbow"))]
+    ratios = []
+    for seed in range(draws(1, 10)):
+        deviations = [
+            np.sqrt(known(displaced(seed, segments)[0]).covariance.diagonal()[arms])
+            for segments in (("pelvis", "upper_trunk"), ())
+        ]
+        ratios.append(deviations[0] / deviations[1])
+    assert 0.6 < np.median(ratios) < 1.3 and np.max(ratios) < 2.0, np.round(ratios, 2)
 
 
 # --- angular velocities

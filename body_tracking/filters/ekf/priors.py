@@ -229,8 +229,12 @@ class Priors:
         """The part of a covariance (n, n), and of that with m other errors (n, m), that orientations leave free.
 
         Priors must not turn a segment whose orientation is measured: their error is the same every time, and would
-        accumulate in the states of the sources.
+        accumulate in the states of the sources. Beside cameras, sensors on the trunk alone do not keep them from
+        turning it: a camera's constant errors of the spine contradict the sensors, and would bend it by 20 degrees
+        (docs/tried.md, "Sensors on the trunk").
         """
+        if state.sensors and not state.sources.beyond_trunk:
+            return covariance, crosses
         speaking = state.stamp_ns - state.sources.stamps < _HELD_FOR_NS
         if not speaking.any():
             return covariance, crosses
