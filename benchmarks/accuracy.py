@@ -41,6 +41,7 @@ from body_tracking.core.sources import RecordedFrame
 from body_tracking.evaluation.metrics import Curve, Trajectory, find_delay, joint_errors
 from body_tracking.evaluation.segments import segment_frames
 from body_tracking.filters import DEFAULT_FILTER
+from body_tracking.inertial.simulated import SimulatedImu, usual_mounting
 from body_tracking.kinect.occlusion import Capsules, obstruction
 from body_tracking.kinect.simulated import KinectErrors, parameters
 from body_tracking.kinematics.positional import ANGLE_NAMES, positional_angles
@@ -79,14 +80,20 @@ class Run:
     parameter: str = ""
     factor: float = 1.0
 
-    def recording(self, *, offsets_alone: bool = False) -> SimulatedRecording:
-        """Simulate the run; with ``offsets_alone``, the offsets of the joint centres are the sensors' only errors."""
+    def recording(self, *, offsets_alone: bool = False, imus: Sequence[str] = ()) -> SimulatedRecording:
+        """Simulate the run.
+
+        Args:
+            offsets_alone: the offsets of the joint centres are the cameras' only errors.
+            imus: segments that carry an inertial sensor.
+        """
         errors = KinectErrors()
         if self.parameter:
             errors = errors.scaled(self.factor, (self.parameter,))
         if offsets_alone:
             errors = errors.offsets_alone()
-        return simulate(Setup(self.motion, layout(self.layout), seed=self.seed, errors=errors))
+        worn = tuple(SimulatedImu(f"imu_{each}", each, usual_mounting(each), oriented=True) for each in imus)
+        return simulate(Setup(self.motion, layout(self.layout), imus=worn, seed=self.seed, errors=errors))
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ motions and seeds are those of the table in docs/accuracy.md; no filter was tune
   python benchmarks/every_angle.py --motions squat --convention model
   python benchmarks/every_angle.py --sensors kinect1 --motions walking_and_turning --seeds 6   the first one alone
   python benchmarks/every_angle.py --set posture=false    ``ekf`` with a mechanism switched off
+  python benchmarks/every_angle.py --imus pelvis upper_trunk   with inertial sensors, which ``ekf`` takes
 """
 
 from __future__ import annotations
@@ -40,15 +41,18 @@ Errors = dict[str, dict[str, tuple[FloatArray, FloatArray]]]
 """By filter and angle without its side: (n,) errors and (n,) stated standard deviations, radians."""
 
 
-def errors_of(convention: str, sensors: tuple[str, ...], ekf: Mapping[str, float], run: Run) -> Errors:
+def errors_of(
+    convention: str, sensors: tuple[str, ...], imus: tuple[str, ...], ekf: Mapping[str, float], run: Run
+) -> Errors:
     """The errors of one person's angles, with these parameters of ``ekf``."""
     found: Errors = {}
     with tempfile.TemporaryDirectory() as folder:
-        write_bag(run.recording(), Path(folder) / "in")
+        write_bag(run.recording(imus=imus), Path(folder) / "in")
         for name in FILTERS:
             out = Path(folder) / name
             given = {"skeleton_filter": {f"ekf.{key}": value for key, value in ekf.items()}}
-            settings = ReplaySettings(sensors, filter_name=name, convention=convention, parameters=given)
+            worn = tuple(f"{each}:imu_{each}" for each in imus)
+            settings = ReplaySettings(sensors, filter_name=name, convention=convention, imus=worn, parameters=given)
             replay(Path(folder) / "in", out, settings)
             tracked = read(out)
             true = canonical(tracked.true_angles)
@@ -114,11 +118,12 @@ def main() -> int:
     parser = common.parser(__doc__, seeds=1, motions=list(MOTIONS), jobs=True)
     parser.add_argument("--convention", choices=list(CONVENTIONS), default="isb", help="default: %(default)s")
     parser.add_argument("--sensors", nargs="+", default=[], metavar="NAME", help="default: both")
+    parser.add_argument("--imus", nargs="+", default=[], metavar="SEGMENT", help="segments with inertial sensors")
     common.add_set(parser)
     args = parser.parse_args()
     cases = [(motion, layout) for motion in args.motions for layout in LAYOUTS for _ in range(args.seeds)]
     runs = [Run(motion, layout, _FIRST_SEED + number) for number, (motion, layout) in enumerate(cases)]
-    work = functools.partial(errors_of, args.convention, tuple(args.sensors), dict(args.set))
+    work = functools.partial(errors_of, args.convention, tuple(args.sensors), tuple(args.imus), dict(args.set))
     people = common.mapped(work, runs, args.jobs)
     figures = {
         name: {kind: figures_of([each[name][kind] for each in people]) for kind in people[0][name]} for name in FILTERS
