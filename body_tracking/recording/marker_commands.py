@@ -73,7 +73,7 @@ def sources_of(bag: BagReader | RigReader, folder: Path) -> tuple[str, ...]:
             return topics
     wanted = " or ".join(topics[0] for topics in sources)
     rig = "" if len(sources) > 1 else f". Images need {folder / setup.RIG}, which is not there"
-    raise MarkerCommandError(f"{bag.path}: no topic {wanted}; it has {', '.join(sorted(bag.topics))}{rig}")
+    raise MarkerCommandError(f"{bag.path}: no topic {wanted}; {graph.listed(bag.topics)}{rig}")
 
 
 def track(

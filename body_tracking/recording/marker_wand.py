@@ -29,6 +29,7 @@ from body_tracking.markers.rig import POSE
 from body_tracking.markers.rig_storage import load_rig, save_rig
 from body_tracking.markers.stages import DetectorStage
 from body_tracking.markers.wand import Wand, WandCalibration, calibrate_wand, centred
+from body_tracking.pipeline import graph
 from body_tracking.pipeline.offline import OfflineRunner
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rig import RigReader
@@ -113,7 +114,7 @@ def read_wand(path: Path, cameras: Sequence[Camera], wand: Wand) -> WandRecordin
         chosen = next((each for each in topics[:2] if all(topic in bag.topics for topic in each)), None)
         if chosen is None:
             missing = [topic for topic in topics[0] if topic not in bag.topics]
-            raise WandRecordingError(f"{path}: no topic {', '.join(missing)}; it has {', '.join(sorted(bag.topics))}")
+            raise WandRecordingError(f"{path}: no topic {', '.join(missing)}; {graph.listed(bag.topics)}")
         names = tuple(setup.camera_name(frame) for frame in frames)
         stage = DetectorStage(check_all(DetectorStage.PARAMETERS, {"cameras": names}))
         runner = OfflineRunner([stage], BAG_WIRE, take)

@@ -22,6 +22,7 @@ from body_tracking.mesh.stage import MeshStage
 from body_tracking.mesh.topics import body_index_topic, depth_topic, info_topic, mesh_topic
 from body_tracking.messages.cdr import stamp_of
 from body_tracking.messages.codecs import CameraInfo
+from body_tracking.pipeline import graph
 from body_tracking.pipeline.offline import OfflineRunner
 from body_tracking.recording.picture import write_picture
 from body_tracking.recording.progress import Progress
@@ -46,7 +47,7 @@ def _messages(bag: RigReader, camera: str, *more: str) -> Iterator[tuple[str, by
     for topic in topics:
         if topic not in bag.topics:
             made = f", which replay --depth {camera} makes" if topic == mesh_topic(camera) else ""
-            raise MeshCommandError(f"{bag.path}: no topic {topic}{made}; it has {', '.join(sorted(bag.topics))}")
+            raise MeshCommandError(f"{bag.path}: no topic {topic}{made}; {graph.listed(bag.topics)}")
     for raw in bag.messages(topics):
         yield raw.topic, raw.cdr, raw.log_time_ns
 

@@ -14,8 +14,7 @@ from body_tracking.kinematics.compiled_body import Linearised
 
 _DIMENSIONS = 3
 _RECENT_NS = NANOSECONDS // 5
-"""Time before the newest frame in which a sensor's last one must lie for it to count as seeing the person; and before
-the state, in which an orientation must lie."""
+"""Time before the newest frame in which a sensor's last one must lie for it to count as seeing the person."""
 
 
 class Displacement:
@@ -73,7 +72,7 @@ class Displacement:
         """(53, 53) information of the orientations measured lately, whose errors are those before any is learnt."""
         space, sources = self._space, state.sources
         information = np.zeros_like(self._prior_information)
-        for number in np.flatnonzero(state.stamp_ns - sources.stamps < _RECENT_NS):
+        for number in np.flatnonzero(sources.speaking(state.stamp_ns)):
             misalignment, heading = sources.stated[number]
             error = sources.slow_variance[number] + np.diag([misalignment, misalignment, misalignment + heading])
             turning = lines.rotation_jacobian[sources.segments[number]]

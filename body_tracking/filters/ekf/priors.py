@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from body_tracking.core.skeleton import NANOSECONDS, FloatArray, SingleArray
+from body_tracking.core.skeleton import FloatArray, SingleArray
 from body_tracking.filters.ekf.kernels import pseudo_measured
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.state import State, StateSpace, single
@@ -33,8 +33,6 @@ _FAR_BEYOND, _BACK_TO = np.radians(10.0), np.radians(8.0)
 """Radians: an estimate farther beyond a range than ``_FAR_BEYOND`` is brought back to ``_BACK_TO`` beyond it."""
 _HELD_STDDEV = 0.002
 """Radians: standard deviation by which priors may rotate a segment with a measured orientation."""
-_HELD_FOR_NS = NANOSECONDS // 4
-"""A source without a measurement for longer does not constrain its segment."""
 
 
 class Priors:
@@ -229,13 +227,9 @@ class Priors:
         """The part of a covariance (n, n), and of that with m other errors (n, m), that orientations leave free.
 
         Priors must not turn a segment whose orientation is measured: their error is the same every time, and would
-        accumulate in the states of the sources. Beside cameras, sensors on the trunk alone do not keep them from
-        turning it: a camera's constant errors of the spine contradict the sensors, and would bend it by 20 degrees
-        (docs/tried.md, "Sensors on the trunk").
+        accumulate in the states of the sources.
         """
-        if state.sensors and not state.sources.beyond_trunk:
-            return covariance, crosses
-        speaking = state.stamp_ns - state.sources.stamps < _HELD_FOR_NS
+        speaking = state.sources.speaking(state.stamp_ns)
         if not speaking.any():
             return covariance, crosses
         t = self._space.tangent

@@ -37,8 +37,7 @@ STRETCH = 0.067
 6.7 % for a Kinect v2 (root mean square over clips of UI-PRMD)."""
 _BESIDE_ORIENTATIONS = 3.0
 """With orientations, least variance of a camera's slow errors as a multiple of the variance that it states: without
-them, its constant errors are explained by a body of other proportions. Not with those of the trunk alone
-(docs/tried.md, "Sensors on the trunk")."""
+them, its constant errors are explained by a body of other proportions."""
 _ALONE = 0.1
 """Factor on the parameter ``slow_scale`` for a single sensor: without it, average segment lengths outweigh the person's
 in the first seconds, and elbows err by 10 instead of 6 degrees (``benchmarks/kinect_vs_vicon.py``)."""
@@ -46,6 +45,7 @@ _LEAST_ERROR = 0.004
 """Metres: least standard deviation of a sensor's joint centres, white and slow errors together."""
 _SIGNIFICANT = 2.0
 """Standard deviations above zero from which a scale of slow errors is used."""
+_UPPER_TRUNK = SEGMENT_NUMBER["upper_trunk"]
 _SLOW_PERIOD_NS = NANOSECONDS // 15
 _SLOW_STEP = 0.02
 """Least relative change of a scale: each change requires a correction of the state."""
@@ -170,7 +170,7 @@ class SensorErrors:
             The scale to be used, its estimate, and the information of the estimate.
         """
         least = self.least_slow(sensor.white, measurement)
-        if sources.beyond_trunk and measurement.skeleton.covariances is not None:
+        if sources.names and measurement.skeleton.covariances is not None:
             least = max(least, _BESIDE_ORIENTATIONS)
         # The scale changes slowly, and its computation is expensive: 15 times a second are enough.
         soon = sensor.stamps and measurement.stamp_ns // _SLOW_PERIOD_NS == sensor.stamps[-1] // _SLOW_PERIOD_NS
@@ -233,7 +233,7 @@ class SensorErrors:
         arm). With cameras alone real arms err by 5.1 instead of 4.8 and 6.5 instead of 5.9 degrees with correlated
         ones (``benchmarks/kinect_vs_vicon.py``), and sensors on the trunk measure the twist themselves.
         """
-        return bool(sources.names) and bool((sources.segments > SEGMENT_NUMBER["upper_trunk"]).all())
+        return bool(sources.names) and bool((sources.segments > _UPPER_TRUNK).all())
 
     def place_of(self, state: State, sensor: str) -> int:
         """First column of a sensor's slow errors in ``State.crosses``."""
