@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import stat
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -100,6 +101,11 @@ def write_text(path: Path, text: str, error: type[BodyTrackingError] | None = No
     except OSError as reason:
         said = f"cannot be written ({reason.strerror})"
         raise FileError(said) if error is None else error(f"{path}: {said}") from reason
+
+
+def natural(name: str) -> tuple[list[str | int], str]:
+    """Sort key of a file name with its numbers as numbers: ``10.png`` after ``9.png``."""
+    return [int(part) if k % 2 else part for k, part in enumerate(re.split(r"([0-9]+)", name))], name
 
 
 def check_new(path: Path, *, overwrite: bool) -> None:

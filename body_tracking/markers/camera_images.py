@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.files import natural
 from body_tracking.core.message_types import IMAGE
 from body_tracking.core.parameters import Parameter, Value
 from body_tracking.core.qos import LATCHED, Qos
@@ -77,7 +78,7 @@ class FolderImages:
                 raise CameraError(f"{folder / camera}: no such folder; each camera has one, with files of equal names")
             names.append({path.name for path in (folder / camera).iterdir() if path.is_file()})
         self._folders = [folder / camera for camera in cameras]
-        self._names = sorted(set.intersection(*names))
+        self._names = sorted(set.intersection(*names), key=natural)
         self.unpaired = sum(len(each) for each in names) - len(names) * len(self._names)
         if not self._names:
             counts = ", ".join(f"{len(each)} in {camera}" for camera, each in zip(cameras, names, strict=True))

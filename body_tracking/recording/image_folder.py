@@ -8,8 +8,8 @@
     FOLDER/depth_info.yaml    of the depth images; default: those of the colour images at the depth images' size
 
 A file name with a decimal point is the stamp in seconds (``1305031102.175304.png``, as in the RGB-D benchmark of the TU
-Munich); other files are numbered at a given rate. Colour files go into the bag unchanged, depth images are encoded
-again in millimetres.
+Munich); other files are numbered at a given rate, in the order of the numbers in their names. Colour files go into the
+bag unchanged, depth images are encoded again in millimetres.
 """
 
 from __future__ import annotations
@@ -113,6 +113,10 @@ def import_folder(
     colour, depth = _stamped(colour_folder, rate), _stamped(folder / "depth", rate)
     if not colour:
         raise ImageFolderError(f"{colour_folder}: no PNG or JPEG images")
+    stamped = all(_stamp(path.stem) is not None for path in (*colour.values(), *depth.values()))
+    if depth and len(colour) != len(depth) and not stamped:
+        numbers = f"{len(colour)} colour and {len(depth)} depth images"
+        raise ImageFolderError(f"{folder}: {numbers}, whose names are no stamps: which belong together?")
     info = _read_info(folder / "camera_info.yaml", frame)
     infos = {names.colour_info: info}
     if depth:
@@ -151,7 +155,8 @@ def _stamped(folder: Path, rate: float) -> dict[int, Path]:
     """Image files of a folder by stamp, nanoseconds, in order; empty without the folder."""
     if not folder.is_dir():
         return {}
-    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES and path.is_file())
+    paths = [path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES and path.is_file()]
+    paths.sort(key=lambda path: files.natural(path.name))
     found: dict[int, Path] = {}
     for number, path in enumerate(paths):
         stamp_ns = _stamp(path.stem)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from body_tracking.core.errors import BodyTrackingError, did_you_mean
-from body_tracking.core.files import check_new
+from body_tracking.core.files import check_new, natural
 from body_tracking.core.parameters import Value, check_all
 from body_tracking.core.skeleton import FloatArray
 from body_tracking.markers import setup
@@ -174,7 +174,8 @@ def calibrate(args: argparse.Namespace) -> int:
     names, series = [], []
     for entry in args.camera:
         name, _, folder = entry.partition("=")
-        files = sorted(path for path in Path(folder).glob("*") if path.is_file()) if folder else []
+        files = [path for path in Path(folder).glob("*") if path.is_file()] if folder else []
+        files.sort(key=lambda path: natural(path.name))
         if not name or not folder:
             raise MarkerCommandError(f"camera {entry!r}: expected NAME=FOLDER, a folder with its images")
         if not files:

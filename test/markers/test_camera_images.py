@@ -69,8 +69,8 @@ def write(folder: Path, camera: str, name: str, image: NDArray[Any]) -> None:
 def test_files_of_equal_names_are_a_set_with_one_stamp(lab: Path) -> None:
     folder = lab / "images"
     for number in range(3):
-        write(folder, "left", f"{number:02d}.png", picture(number))
-        write(folder, "right", f"{number:02d}.png", picture(10 + number, np.uint16))
+        write(folder, "left", f"{8 + number}.png", picture(number))
+        write(folder, "right", f"{8 + number}.png", picture(10 + number, np.uint16))
     write(folder, "left", "03.png", picture(3))
     stage = made(lab, f"folder:{folder}", rate=100.0)
     sets = polled(stage, 10 * MS, 6)

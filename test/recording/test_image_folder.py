@@ -19,6 +19,7 @@ from body_tracking.messages.codecs import CameraInfo
 from body_tracking.recording.image_folder import import_folder
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, deserialize
 
+COLOUR = "/camera1/color/image_raw/compressed"
 STAMPS = ("1305031102.175304", "1305031102.211214", "1305031102.243211")
 
 
@@ -71,11 +72,22 @@ def test_images_stamps_and_intrinsics_are_in_the_bag(tmp_path: Path, capsys: pyt
 
 
 def test_files_without_stamps_come_at_the_rate(tmp_path: Path) -> None:
-    images = folder(tmp_path / "images", ("0001", "0002", "0010"))
+    images = folder(tmp_path / "images", ("1", "2", "10"))
     import_folder(images, tmp_path / "bag", "camera1", 10.0, 1000.0)
     with BagReader(tmp_path / "bag") as reader:
-        stamps = [raw.log_time_ns for raw in reader.messages(["/camera1/color/image_raw/compressed"])]
-    assert stamps == [100_000_000, 200_000_000, 300_000_000]
+        found = [CompressedColour().decode(raw.cdr, BAG_WIRE) for raw in reader.messages([COLOUR])]
+    assert [stamp_ns for stamp_ns, *_ in found] == [100_000_000, 200_000_000, 300_000_000]
+    assert [int(pixels[0, 0, 0]) for *_, pixels in found] == [20, 80, 140], "10.png comes after 2.png"
+
+
+def test_numbered_files_of_which_some_lack_are_not_paired(tmp_path: Path) -> None:
+    images = folder(tmp_path / "images", ("1", "2", "3"))
+    (images / "depth" / "2.png").unlink()
+    with pytest.raises(BodyTrackingError, match="3 colour and 2 depth images, whose names are no stamps"):
+        import_folder(images, tmp_path / "bag", "camera1", 10.0, 1000.0)
+    stamped = folder(tmp_path / "stamped")
+    next((stamped / "depth").iterdir()).unlink()
+    assert import_folder(stamped, tmp_path / "bag", "camera1", 10.0, 1000.0).depth == 2
 
 
 def info(images: Path) -> Path:
