@@ -218,10 +218,13 @@ def found_boards(names: Sequence[str], seen: Sequence[int], images: int) -> list
 
 def target(args: argparse.Namespace) -> int:
     """``markers target``."""
+    path = args.setup / setup.TARGETS
+    others = load_targets(path) if path.exists() else []
+    if args.name in [each.name for each in others] and not args.overwrite:
+        raise MarkerCommandError(f"{path}: has a target {args.name} already; --overwrite replaces it")
+    others = [each for each in others if each.name != args.name]
     views, covariance, whole = _views(args)
     found = calibrate_target(args.name, views, covariance, args.diameter, flexible=bool(args.labels))
-    path = args.setup / setup.TARGETS
-    others = [each for each in (load_targets(path) if path.exists() else []) if each.name != args.name]
     check_distinct([*others, found.target], max(found.noise, 2e-4))
     args.setup.mkdir(parents=True, exist_ok=True)
     save_targets([*others, found.target], path)
@@ -274,8 +277,9 @@ def fit(args: argparse.Namespace) -> int:
         if len(parts) != 4 or parts[1] not in tuple(JointKind):
             raise MarkerCommandError(f"joint {entry!r}: expected NAME:KIND:PARENT:CHILD, KIND {', '.join(JointKind)}")
         joints.append(JointDescription(parts[0], parts[2], parts[3], JointKind(parts[1])))
-    found = fit_recording(args.bag, args.setup, joints, args.diameter)
     path = args.setup / setup.CHAIN
+    check_new(path, overwrite=args.overwrite)
+    found = fit_recording(args.bag, args.setup, joints, args.diameter)
     save_chain(found.chain, path)
     path.with_suffix(".urdf").write_text(to_urdf(found.chain, setup.BODY), encoding="utf-8")
     report = {
@@ -354,7 +358,11 @@ def _say(args: argparse.Namespace, report: Mapping[str, Any], lines: Iterable[st
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """``body_tracking markers``."""
-    top = subparsers.add_parser("markers", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    top = subparsers.add_parser(
+        "markers",
+        description="The cameras, the targets and the chain of the marker system, and its angles offline. A folder "
+        "has what the nodes need: calibrate and wand write its rig.yaml, target its targets.yaml, fit its chain.yaml.",
+    )
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
     def command(name: str, run: Callable[[argparse.Namespace], int], does: str) -> argparse.ArgumentParser:
@@ -398,6 +406,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         metavar="LABEL,...",
         help="measure it by these trajectories of a file with labels, in which there may be others",
     )
+    parser.add_argument("--overwrite", action="store_true", help="replace a target of this name")
 
     parser = command("fit", fit, "Estimate the joints between targets from their motion; writes chain.yaml and a URDF.")
     parser.add_argument("bag", type=Path, metavar="BAG", help="a recording in which every joint moves")
@@ -408,6 +417,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         metavar="NAME:KIND:PARENT:CHILD",
         help=f"a joint between two targets; KIND is {', '.join(JointKind)}",
     )
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing chain.yaml")
 
     parser = command("angles", angles, "Compute the joint angles in a recording; writes them into a new one.")
     parser.add_argument("bag", type=Path, metavar="BAG", help="a recording of images, balls or points")

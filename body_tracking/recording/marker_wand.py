@@ -19,6 +19,7 @@ from scipy.linalg import block_diag
 from body_tracking.core import so3
 from body_tracking.core.camera import Camera
 from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.files import check_new
 from body_tracking.core.parameters import check_all
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.markers import projection, setup
@@ -170,6 +171,9 @@ def wand(args: argparse.Namespace) -> int:
         places = tuple(float(part) for part in args.places.split(","))
     except ValueError as error:
         raise WandRecordingError(f"--places {args.places!r}: expected metres along the wand, as 0,0.15,0.45") from error
+    path = args.setup / setup.RIG
+    # the poses in the rig with the lenses are there to be replaced
+    check_new(path, overwrite=args.overwrite or not args.lenses or args.setup in args.lenses)
     held = Wand(places, args.deviation)
     cameras, covariance = read_lenses(args.lenses or [args.setup])
     recording = read_wand(args.bag, cameras, held)
@@ -177,7 +181,6 @@ def wand(args: argparse.Namespace) -> int:
     if args.diameter:
         found = calibrate_wand(cameras, centred(found, recording.seen, args.diameter), held, covariance)
     args.setup.mkdir(parents=True, exist_ok=True)
-    path = args.setup / setup.RIG
     save_rig(found.rig, path)
     report = {"rig": str(path), **report_of(found, recording)}
     if args.json:
@@ -223,6 +226,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     parser.add_argument(
         "--diameter", type=float, default=0.0, metavar="METRES", help="of the balls; 0 takes centroids for centres"
+    )
+    parser.add_argument(
+        "--overwrite", action="store_true", help="with --lenses of other setups: replace an existing rig.yaml"
     )
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
     parser.set_defaults(run=wand)

@@ -59,8 +59,10 @@ def test_a_target_is_measured_from_a_recording(turned: Path, capsys: pytest.Capt
     assert (found.name, report["name"]) == ("hand", "hand")
     assert np.abs(distances(found.points) - distances(TARGET_POINTS)).max() < 2e-4
     assert report["views"] > 50 and report["stddev_mm"] < 0.1
-    # the same target again replaces it; another of the same shape is refused
-    assert cli.main(["markers", *words]) == 0
+    # the same target again replaces it if asked to; another of the same shape is refused
+    assert cli.main(["markers", *words]) == 2
+    assert "has a target hand already; --overwrite replaces it" in capsys.readouterr().err
+    assert cli.main(["markers", *words, "--overwrite"]) == 0
     assert cli.main(["markers", *[word if word != "hand" else "twin" for word in words]]) == 2
     assert [each.name for each in load_targets(turned / setup.TARGETS)] == ["hand"]
 
@@ -100,7 +102,9 @@ def test_a_wand_calibrates_three_cameras(waved: Path, tmp_path: Path, capsys: py
         expected = -1e3 * truth.rotations[index].T @ truth.translations[index]
         assert np.linalg.norm(expected - each["position_mm"]) <= 4.0 * each["translation_stddev_mm"] + 1e-9
         assert each["images"] == 60 and each["with_wand"] > 30 and each["rms_px"] < 0.1
-    assert cli.main(["markers", *words]) == 0
+    assert cli.main(["markers", *words]) == 2
+    assert "rig.yaml: exists already; --overwrite replaces it" in capsys.readouterr().err
+    assert cli.main(["markers", *words, "--overwrite"]) == 0
     out = capsys.readouterr().out
     assert "b: at " in out and " mm (± " in out and " deg (± " in out
 
@@ -181,6 +185,16 @@ def test_a_rig_that_a_wand_has_placed_is_not_replaced_without_a_word(
     assert cli.main([*words, "--overwrite"]) == 2
     assert "exists already" not in capsys.readouterr().err
     assert (tmp_path / setup.RIG).read_bytes() == before
+
+
+def test_a_chain_is_not_replaced_without_a_word(
+    turned: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / setup.CHAIN).write_text("kept")
+    words = ["fit", str(turned / "bag"), "--setup", str(tmp_path), "--joint", "wrist:hinge:hand:arm"]
+    assert cli.main(["markers", *words]) == 2
+    assert "chain.yaml: exists already; --overwrite replaces it" in capsys.readouterr().err
+    assert (tmp_path / setup.CHAIN).read_text() == "kept"
 
 
 def test_few_boards_are_a_warning() -> None:
