@@ -59,6 +59,7 @@ CSV_SUFFIXES = (".csv", ".csv.gz")
 NTU_SUFFIX = ".skeleton"
 MVNX_SUFFIXES = (".mvnx", ".mvnx.gz")
 BAG_SUFFIX = ".mcap"
+_RATE, _DEPTH_SCALE = 30.0, 1000.0
 SUFFIXES = (*CSV_SUFFIXES, NTU_SUFFIX, *MVNX_SUFFIXES, C3D_SUFFIX)
 
 _Item = RecordedFrame | RecordedImu | RecordedAngles | RecordedPoints | RecordedDepth | RecordedMarkers
@@ -224,9 +225,10 @@ def import_files(
         _open_any(path, name, partial, labels, noise)
         for path, name in zip(files, _names(files, sensors or {}), strict=True)
     ]
-    if labels and not any(isinstance(each, TrajectoryRecording) for each in recordings):
+    points = any(isinstance(each, TrajectoryRecording) for each in recordings)
+    if (labels or noise != DEFAULT_NOISE) and not points:
         given = ", ".join(map(str, files))
-        raise ImportFileError(f"{given}: no points of a motion capture system, of which --labels would choose")
+        raise ImportFileError(f"{given}: no points of a motion capture system, for which --labels and --noise are")
     found: dict[str, ImportedSensor] = {}
     owners: dict[str, Path] = {}
     # Read all files before an existing bag is replaced: an invalid file must not destroy it.
@@ -244,7 +246,8 @@ def import_files(
             owner = TRUE_ANGLES if isinstance(item, RecordedAngles) else item.sensor
             if owners.setdefault(owner, path) != path:
                 what = owner if isinstance(item, RecordedAngles) else f"sensor {owner!r}"
-                raise ImportFileError(f"{what} is in {owners[owner]} and in {path}")
+                hint = "" if isinstance(item, RecordedAngles) else f"; --sensor NAME={path} sets another name"
+                raise ImportFileError(f"{what} is in {owners[owner]} and in {path}{hint}")
             for topic, type_name, qos, message in messages:
                 if topic not in topics:
                     writer.add_topic(topic, type_name, qos)
@@ -383,14 +386,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--rate",
         type=float,
-        default=30.0,
+        default=_RATE,
         metavar="HZ",
         help="images a second of a folder whose files have no stamps as names (default %(default)s)",
     )
     parser.add_argument(
         "--depth-scale",
         type=float,
-        default=1000.0,
+        default=_DEPTH_SCALE,
         metavar="N",
         help="numbers to a metre in its depth images (default %(default)s: millimetres)",
     )
@@ -406,11 +409,16 @@ def run(args: argparse.Namespace) -> int:
     if any(map(is_image_folder, args.files)):
         if len(args.files) > 1:
             raise ImportFileError(f"{args.files[0]}: a folder of images is imported alone")
+        if args.labels or args.noise != DEFAULT_NOISE or args.partial:
+            raise ImportFileError(f"{args.files[0]}: --labels, --noise and --partial are not for a folder of images")
         camera = _parse_sensors(args.sensor, args.files).get(args.files[0], "camera1")
         given = args.files[0], args.output, camera, args.rate, args.depth_scale
         images = import_folder(*given, overwrite=args.overwrite)
         print(images.as_json() if args.json else images.text())
         return 0
+    if (args.rate, args.depth_scale) != (_RATE, _DEPTH_SCALE):
+        named = ", ".join(map(str, args.files))
+        raise ImportFileError(f"{named}: no folder of images, for which --rate and --depth-scale are")
     report = import_files(
         args.files,
         args.output,

@@ -213,6 +213,11 @@ def test_recovering_says_what_was_missing_and_leaves_a_whole_bag_as_it_is(tmp_pa
         (["import", "absent.csv", "-o", "bag"], "no such file"),
         (["import", "a.txt", "-o", "bag"], "a.txt: not a .csv, .csv.gz, .skeleton, .mvnx, .mvnx.gz or .c3d file"),
         (["import", "a.csv", "-o", "bag", "--labels", "A"], "a.csv: no points of a motion capture system"),
+        (["import", "a.csv", "-o", "bag", "--noise", "0.1"], "a.csv: no points of a motion capture system"),
+        (["import", "a.csv", "-o", "bag", "--rate", "10"], "a.csv: no folder of images, for which --rate"),
+        (["import", "a.csv", "-o", "bag", "--depth-scale", "1"], "a.csv: no folder of images, for which --rate"),
+        (["import", "images", "-o", "bag", "--labels", "A"], "images: --labels, --noise and --partial are not for"),
+        (["import", "images", "-o", "bag", "--partial"], "images: --labels, --noise and --partial are not for"),
         (["import", "empty.mvnx", "-o", "bag"], "empty.mvnx: the file is empty"),
         (["import", "taken", "-o", "bag"], "taken: a folder without images in rgb/, color/ or colour/"),
         (["import", "folder.csv", "-o", "bag"], "folder.csv: a folder without images"),
@@ -241,6 +246,7 @@ def test_errors_are_one_line(tmp_path, monkeypatch, capsys, arguments, text):
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "precious.txt").touch()
     (tmp_path / "empty.mvnx").touch()
+    (tmp_path / "images" / "rgb").mkdir(parents=True)
     (tmp_path / "folder.csv").mkdir()
     os.mkfifo(tmp_path / "pipe.csv")
     import_files([tmp_path / "a.csv"], tmp_path / "made")
