@@ -10,6 +10,7 @@ from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 
 from body_tracking import systems
+from body_tracking.core.names import in_launch
 
 DEFAULTS = {"camera": "camera1", "driver": "realsense"}
 
@@ -17,7 +18,7 @@ DEFAULTS = {"camera": "camera1", "driver": "realsense"}
 def generate_launch_description() -> LaunchDescription:
     """What ``ros2 launch`` asks for; all further arguments are those of the graph."""
     declared = [
-        DeclareLaunchArgument(name, default_value=value, description=systems.OPTIONS[name].text)
+        DeclareLaunchArgument(name, default_value=value, description=in_launch(systems.OPTIONS[name].text))
         for name, value in DEFAULTS.items()
     ]
     graph = PythonLaunchDescriptionSource(str(Path(__file__).parent / "two_kinects.launch.py"))

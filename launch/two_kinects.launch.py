@@ -3,6 +3,9 @@
 ros2 launch body_tracking two_kinects.launch.py bag:=/path/to/bag record:=/path/to/new/bag filter:=ekf
 """
 
+import sys
+from pathlib import Path
+
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, RegisterEventHandler, Shutdown
 from launch.event_handlers import OnProcessExit
@@ -11,6 +14,8 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from body_tracking import systems
+from body_tracking.core.errors import BodyTrackingError, did_you_mean
+from body_tracking.core.names import in_launch
 from body_tracking.core.parameters import Value, to_ros
 from body_tracking.pipeline.system import NodeSpec, Option
 from body_tracking.ros.up import CANNOT_START, STOP_TIMEOUT, UpError, all_parameters, arguments_from, options_for
@@ -18,6 +23,21 @@ from body_tracking.ros.up import CANNOT_START, STOP_TIMEOUT, UpError, all_parame
 OPTIONS = [option for option in systems.OPTIONS.values() if not option.hidden]
 TRUTH = {"true": True, "1": True, "false": False, "0": False}
 """As conditions of launch take it."""
+
+
+def check_names(context: LaunchContext) -> None:
+    """Refuse a misspelt argument, which launch would ignore.
+
+    Only where the command line starts a launch file of this package: one that includes this may have its own arguments.
+    """
+    own = {path.name for path in Path(__file__).parent.glob("*.launch.py")}
+    if own.isdisjoint(Path(word).name for word in sys.argv):
+        return
+    names = [option.name for option in OPTIONS]
+    for argument in context.argv:
+        name, assigned, _ = argument.partition(":=")
+        if assigned and name not in names:
+            raise UpError(f"{name}: no such argument{did_you_mean(name, names) or '; --show-args lists them'}")
 
 
 def default_of(option: Option) -> str:
@@ -60,6 +80,15 @@ def action(spec: NodeSpec, parameters: dict[str, Value]) -> Node:
 
 
 def graph(context: LaunchContext) -> list[LaunchDescriptionEntity]:
+    """The actions for the arguments; an error names them as launch does."""
+    try:
+        check_names(context)
+        return actions(context)
+    except BodyTrackingError as error:
+        raise UpError(in_launch(str(error))) from error
+
+
+def actions(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     """The nodes for the arguments; everything ends with the bag, or with a node that cannot start."""
     args = arguments_from(words(context))
     options = options_for(args)
@@ -80,7 +109,7 @@ def graph(context: LaunchContext) -> list[LaunchDescriptionEntity]:
 def generate_launch_description() -> LaunchDescription:
     """What ``ros2 launch`` asks for."""
     declared = [
-        DeclareLaunchArgument(option.name, default_value=default_of(option), description=option.text)
+        DeclareLaunchArgument(option.name, default_value=default_of(option), description=in_launch(option.text))
         for option in OPTIONS
     ]
     return LaunchDescription([*declared, OpaqueFunction(function=graph)])

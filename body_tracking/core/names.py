@@ -62,3 +62,8 @@ def rig_namespace(topics: Iterable[str]) -> str:
     """The namespace of the rig with these full topic names; the root where there is no rig or more than one."""
     found = {match[1] for topic in topics if (match := _RIG.fullmatch(topic))}
     return found.pop() or "/" if len(found) == 1 else "/"
+
+
+def in_launch(text: str) -> str:
+    """A text with options as ``ros2 launch`` names them: ``camera_rig`` for ``--camera-rig``."""
+    return re.sub(r"--([a-z]+(?:-[a-z]+)*)", lambda found: found[1].replace("-", "_"), text)

@@ -122,6 +122,7 @@ WRONG = {
     (): "nothing to read: give a bag, a parameters file",
     ("bag:={bag}", "record:=there"): "there: exists already",
     ("bag:={bag}", "namespace:=1st"): "1st",
+    ("bag:={bag}", "recrod:=live"): "recrod: no such argument; did you mean 'record'?",
     ("bag:={bag}", "rate:=fast"): "rate: invalid float value: 'fast'",
     ("bag:={bag}", "params_file:=nowhere.yaml"): "nowhere.yaml",
 }
@@ -138,6 +139,12 @@ def test_wrong_values_end_the_launch_in_one_line(tools: Tools) -> None:
         assert launch.ended() == 1
         lines = [line for line in launch.text().splitlines() if "[INFO]" not in line]
         assert len(lines) == 1 and text in lines[0], lines
+
+
+def test_the_list_of_arguments_names_them_as_launch_does(tools: Tools) -> None:
+    for file in ("two_kinects.launch.py", "cameras.launch.py"):
+        said = tools.ask("'params_file':", "launch", "body_tracking", file, "--show-args")
+        assert "camera_rig" in said and not [line for line in said.splitlines() if "--" in line], said
 
 
 def test_node_that_refuses_its_parameters_ends_the_launch(tools: Tools) -> None:
