@@ -18,7 +18,16 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from body_tracking.core.parameters import Parameter, Value, as_yaml, check_all, is_ros_own, is_wildcard, read_file
+from body_tracking.core.parameters import (
+    Parameter,
+    ParameterError,
+    Value,
+    as_yaml,
+    check_all,
+    is_ros_own,
+    is_wildcard,
+    read_file,
+)
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.system import NodeSpec, Options, Place, System, asked, load
 
@@ -159,9 +168,12 @@ def in_order(sections: Mapping[str, dict[str, object]]) -> list[tuple[str, dict[
 
 
 def with_file(options: Options, file: Path | None) -> Options:
-    """The options, with values of a parameters file for those at their defaults; ParameterError for an invalid file.
+    """The options, with values of a parameters file for those at their defaults.
 
     Where neither chooses a filter, it is that of the system of all sensors.
+
+    Raises:
+        ParameterError: an invalid file, or a number of people for a graph that tracks one.
     """
     found = dict(options)
     for pattern, values in in_order(read_file(file) if file is not None else {}):
@@ -177,6 +189,8 @@ def with_file(options: Options, file: Path | None) -> Options:
                 pattern
             ):
                 found[option.name] = value
+    if options["people"] and found["subject"] != "all":
+        raise ParameterError("people: needs --subject all")
     if not found["filter"]:
         found["filter"] = _filter_for(found)
     return found

@@ -179,7 +179,7 @@ def test_subject_is_set_by_file_or_command_line(tmp_path: Path) -> None:
     file = tmp_path / "people.yaml"
     file.write_text("/**: {ros__parameters: {subject: all, people: 4}}\n")
     assert published_angles(systems.with_file(options_of(), file)) == graph.bodies(4)
-    assert systems.with_file(options_of(subject="first", people=3), file)["people"] == 3
+    assert systems.with_file(options_of(people=3), file)["people"] == 3
     assert published_angles(systems.with_file(options_of(subject="first"), file)) == ("body1",)
 
 

@@ -327,6 +327,7 @@ def test_other_mistakes_on_the_command_line(capsys: pytest.CaptureFixture[str], 
     assert "rate 0: expected" in refusal(capsys, "--bag", BAG, "--rate", "0")
     assert "start 600: the bag lasts" in refusal(capsys, "--bag", BAG, "--start", "600")
     assert "loop: needs a bag" in refusal(capsys, "--loop")
+    assert "people: needs --subject all" in refusal(capsys, "--bag", BAG, "--people", "2")
     assert "external" in refusal(capsys, "--bag", BAG, "--external")
     assert "cannot be read" in refusal(capsys, "--params-file", tmp_path / "nowhere.yaml")
     assert "kinect1_skeleton: nothing to read: give a bag" in refusal(capsys, "--sensors", "kinect1")
@@ -369,7 +370,8 @@ def test_up_without_arguments_takes_the_sensors_that_publish(
     monkeypatch.setattr(discovery, "look", lambda namespace: discovery.Domain())
     assert "no sensor publishes in ROS domain" in refusal(capsys)
     (tmp_path / "slow.yaml").write_text("skeleton_filter: {ros__parameters: {filter: ekf}}")
-    assert "no sensor publishes in ROS domain" in refusal(capsys, "--params-file", tmp_path / "slow.yaml")
+    said = refusal(capsys, "--params-file", tmp_path / "slow.yaml")
+    assert "no sensor publishes in ROS domain" in said and "slow.yaml has no section <sensor>_skeleton" in said
 
 
 # --- parameters

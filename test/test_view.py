@@ -33,11 +33,13 @@ def described(bag: Path) -> Recording:
     return found
 
 
-def written(folder: Path, topics: dict[str, str]) -> Path:
+def written(folder: Path, topics: dict[str, str], messages: bool = True) -> Path:
     """A bag with these topics, and one message on another one."""
     with BagWriter(folder) as writer:
         for name, type_name in topics.items():
             writer.add_topic(name, type_name)
+            if messages:
+                writer.write(name, b"", 1)
         writer.add_topic("/note", STRING)
         writer.write_message("/note", BAG_MESSAGES.make(STRING, data=""), 1)
     return folder
@@ -74,6 +76,12 @@ def test_a_recording_of_angles_is_labelled_as_results(tmp_path: Path) -> None:
         written(tmp_path / "live", {**angles, "/kinect1/skeleton": POINT_CLOUD, DIAGNOSTICS: DIAGNOSTICS_TYPE})
     )
     assert found.content == "0.0 s, angles of body1, sensors kinect1" and not found.refusal
+
+
+def test_a_recording_without_frames_cannot_be_played(tmp_path: Path) -> None:
+    """As one that was begun after the bag had ended."""
+    found = described(written(tmp_path / "late", {"/kinect1/skeleton": POINT_CLOUD}, messages=False))
+    assert found.refusal == "It holds no message of a sensor"
 
 
 def test_recordings_and_examples_come_before_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

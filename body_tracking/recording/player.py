@@ -111,10 +111,11 @@ class Playback:
         return self._rate
 
     def bag_time_ns(self, steady_ns: int) -> int:
-        """The bag's time at a steady time that is not before the latest step."""
+        """The bag's time at a steady time that is not before the latest step; it stands still at the end."""
         if self._paused or self._steady_ns is None:
             return self._bag_ns
-        return self._bag_ns + int((steady_ns - self._steady_ns) * self._rate)
+        bag_ns = self._bag_ns + int((steady_ns - self._steady_ns) * self._rate)
+        return min(bag_ns, self._reader.end_ns) if self.finished else bag_ns
 
     def pause(self, steady_ns: int) -> None:
         self._anchor(steady_ns)

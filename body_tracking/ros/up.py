@@ -561,8 +561,11 @@ def no_ros(error: ImportError) -> UpError:
     return UpError(f"no ROS here ({reason}): {remedy}")
 
 
-def _sensors_there(namespace: str) -> Mapping[str, Value]:
-    """The options of a graph that takes the sensors that publish; UpError without any, or without ROS."""
+def _sensors_there(namespace: str, file: Path | None) -> Mapping[str, Value]:
+    """The options of a graph that takes the sensors that publish; UpError without any, or without ROS.
+
+    The error says that the parameters ``file`` names none either.
+    """
     print("looking for sensors that publish", flush=True)
     dds.stay_on_this_machine()
     dds.prepare()
@@ -578,9 +581,10 @@ def _sensors_there(namespace: str) -> Mapping[str, Value]:
             else "anywhere"
         )
         others += "" if namespace == "/" else f" in the namespace {namespace}"
+        said = "" if file is None else f", and {file} has no section <sensor>_skeleton with a backend or a file"
         raise UpError(
             f"no sensor publishes in ROS domain {os.environ.get('ROS_DOMAIN_ID') or '0'} {others}: no skeletons, depth "
-            "images or readings of inertial sensors. Play a recording with --bag BAG, name the sensors with "
+            f"images or readings of inertial sensors{said}. Play a recording with --bag BAG, name the sensors with "
             "--params-file FILE, choose on a page with body_tracking view, or see what publishes: body_tracking doctor"
         )
     print(f"found: {' '.join(flags(found))}", flush=True)
@@ -604,7 +608,7 @@ def run(args: argparse.Namespace) -> int:
         look_for &= not has_sensors(args.params_file) and not names_sensors(_in_file(args.params_file))
     if look_for and not names_sensors(options_from(args)):
         options_for(args)  # raises before anything starts
-        found = _sensors_there(names.check_namespace(args.namespace or "/"))
+        found = _sensors_there(names.check_namespace(args.namespace or "/"), args.params_file)
     supervisor = supervise(args, found)
     return 2 if supervisor.failure else 0
 

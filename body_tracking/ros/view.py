@@ -28,7 +28,7 @@ from body_tracking.pipeline.system import NodeSpec
 from body_tracking.recording.finding import advice_for, bags_in, listed, shipped_bags, shipped_setup, unused
 from body_tracking.recording.rig import RigReader
 from body_tracking.ros import dds
-from body_tracking.ros.up import NoSourceError, UpError, flags, has_sensors, no_ros, options_for, supervise
+from body_tracking.ros.up import NoSourceError, UpError, has_sensors, no_ros, options_for, supervise
 from body_tracking.systems import OPTIONS, add_options, all_nodes_for, names_sensors, options_from, options_of
 
 _NOT_HERE: Final = ("bag", "loop", "start", "record", "external", "viewer")
@@ -84,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
                 continue
             if supervisor.interrupted:
                 return 0
-            said = (supervisor.failure, "failed") if supervisor.failure else (f"{what} has ended; choose anew.", "")
+            said = (supervisor.failure, "failed") if supervisor.failure else (f"{what} has ended; choose again.", "")
     except KeyboardInterrupt:
         return 0
 
@@ -151,7 +151,7 @@ def _choose(
                 break
             except queue.Empty:
                 found = watch.now()
-            sensors = "as named on the command line" if named else " ".join(flags(found.sensors))
+            sensors = "as named on the command line" if named else _in_words(found.sensors)
             page.draw_domain(sensors, found.nodes, found.runs, _absent())
         what = choice.bag.name if choice.bag is not None else "the graph"
         page.say(f"{what} starts; this page shows it in some seconds.", ORANGE)
@@ -193,6 +193,7 @@ def _described(args: argparse.Namespace, bag: Path, where: str) -> Any:
     try:
         with RigReader(bag) as reader:
             types = {name: each.type_name for name, each in reader.topics.items()}
+            counts = {name: each.count for name, each in reader.topics.items()}
             length = f"{(reader.end_ns - reader.start_ns) / NANOSECONDS:.1f} s"
     except BodyTrackingError as error:
         return Recording(bag, where, "cannot be read", str(error).replace(f"{bag}/", ""))
@@ -210,6 +211,9 @@ def _described(args: argparse.Namespace, bag: Path, where: str) -> Any:
         return Recording(bag, where, length, str(error).removeprefix(f"{bag}: "))
     except BodyTrackingError as error:
         return Recording(bag, where, length, str(error).removeprefix(f"{bag}: "))
+    played = options["played"]
+    if isinstance(played, tuple) and not any(counts[name] for name in played if isinstance(name, str)):
+        return Recording(bag, where, length, "It holds no message of a sensor")
     sources = {name: options[name] for name, each in OPTIONS.items() if each.source and options[name]}
     skeletons = {"sensors": options["sensors"]} if options["sensors"] and not options["computed"] else {}
     others = unused(types, options)
@@ -221,5 +225,6 @@ def _in_words(sources: Mapping[str, Value]) -> str:
     texts = (
         f"{name.replace('_', ' ')} {', '.join(value) if isinstance(value, tuple) else ''}"
         for name, value in sources.items()
+        if value is not True
     )
     return "; ".join(map(str.strip, texts))

@@ -155,7 +155,7 @@ def test_from_the_start_page_to_a_recording_and_back(start_page: Browser) -> Non
 
     def listed() -> bool:
         texts.append(browser.text())
-        return "mine has ended; choose anew" in texts[-1]
+        return "mine has ended; choose again" in texts[-1]
 
     browser.until(listed, "the list")
     page.wait_for_timeout(3e3)
@@ -194,7 +194,7 @@ def test_live_sensors_one_of_which_is_lost(start_page: Browser) -> None:
     for sensor in ("kinect1", "kinect2"):
         given = {"sensor": sensor, "file": BAG, "loop": True, "start_time": 1.0}
         running.start("kinect_skeleton", f"{sensor}_skeleton", **given)
-    browser.reads(r"publish --sensors kinect1,kinect2 --external")
+    browser.reads(r"publish sensors kinect1, kinect2")
     browser.reads("/kinect1_skeleton")
     browser.press("start with these sensors")
     browser.reads(r"sensors kinect1 \d+ Hz, kinect2 \d+ Hz")

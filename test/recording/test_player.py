@@ -224,3 +224,14 @@ def test_a_pause_interrupts_catching_up(tmp_path):
 def test_an_offset_beyond_the_end_is_an_error(reader):
     with pytest.raises(BagError, match="no message to play after 60 s"):
         Playback(reader, start_offset_s=60.0)
+
+
+def test_time_stands_still_at_the_end(reader: BagReader) -> None:
+    run = Run(Playback(reader))
+    while run.step():
+        pass
+    assert run.playback.finished
+    later_ns = run.now_ns + 3600 * SECOND
+    assert run.playback.bag_time_ns(later_ns) == reader.end_ns
+    run.playback.pause(later_ns)
+    assert run.playback.bag_time_ns(later_ns) == reader.end_ns

@@ -25,12 +25,12 @@ def test_loop_filter_and_convention_are_offered_again(before: Choice | None) -> 
 
 def test_the_page_is_not_ready_while_another_graph_runs() -> None:
     with StartPage("127.0.0.1", 18080, FILTERS, CONVENTIONS, lambda choice: None) as page:
-        page.say("wave has ended; choose anew.", GREEN)
+        page.say("wave has ended; choose again.", GREEN)
         page.draw_domain("", ("/fusion",), True, "none")
         assert "runs already" in page._state.content and ">ready<" not in page._state.content
         assert "runs already" not in page._nodes.content
         page.say("cannot be read", RED)
         assert "cannot be read" in page._state.content and "runs already" in page._state.content
-        page.say("wave has ended; choose anew.", GREEN)
+        page.say("wave has ended; choose again.", GREEN)
         page.draw_domain("", (), False, "none")
         assert "wave has ended" in page._state.content
