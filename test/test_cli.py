@@ -160,6 +160,16 @@ def test_a_mistyped_recording_is_answered_by_the_one_that_is_meant(
     assert capsys.readouterr().err.endswith(f"{given}: no such recording; did you mean 'bags/tpose_wave'?\n")
 
 
+def test_a_recording_of_quite_another_name_is_not_proposed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("looped").mkdir()
+    Path("looped/looped_0.mcap").touch()
+    assert cli.main(["bag", "info", "nope"]) == 2
+    assert capsys.readouterr().err.endswith("nope: no such recording\n")
+
+
 def test_a_recording_to_play_is_the_first_option_of_up(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         cli.main(["up", "--help"])

@@ -285,6 +285,7 @@ def test_invalid_bag_or_bag_without_skeletons_is_refused(capsys: pytest.CaptureF
         writer.write_message("/fused/skeleton", BAG_MESSAGES.make("std_msgs/msg/String", data=""), 1)
     assert "no topic /<sensor>/skeleton; it has /fused/skeleton" in refusal(capsys, "--bag", tmp_path / "other")
     reported = refusal(capsys, "--bag", BAG.with_name("markers_arm"))
+    assert "/left/image_raw, " in reported and "/ground_truth" not in reported, "nothing plays the truth"
     assert reported.endswith(
         "; add to the command the option that takes them: "
         "--camera SENSOR, --camera-rig FOLDER, --depth SENSOR or --marker-setup FOLDER"

@@ -285,8 +285,9 @@ def check_skeletons(wanted: Iterable[str], topics: Collection[str]) -> None:
 
 
 def listed(topics: Collection[str]) -> str:
-    """What a recording has, for an error that names what it lacks."""
-    return f"it has {', '.join(sorted(topics)) or 'no topics'}"
+    """What a recording has, the truth only if there is nothing else, for an error that names what it lacks."""
+    measured = [topic for topic in sorted(topics) if not topic.startswith("/ground_truth/")]
+    return f"it has {', '.join(measured or sorted(topics)) or 'no topics'}"
 
 
 # --- inputs and conventions

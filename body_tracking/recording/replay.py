@@ -168,9 +168,7 @@ def sensor_topics(bag: BagReader, wanted: Sequence[str] = (), advice: str = "") 
     names = tuple(wanted) or there
     hint = f"; {advice}" if advice and not there else ""
     if not names:
-        raise ReplayError(
-            f"{bag.path}: no topic /<sensor>/skeleton; it holds {', '.join(sorted(bag.topics)) or 'no topics'}{hint}"
-        )
+        raise ReplayError(f"{bag.path}: no topic /<sensor>/skeleton; {graph.listed(bag.topics)}{hint}")
     try:
         graph.check_skeletons(names, bag.topics)
     except graph.GraphError as error:

@@ -356,7 +356,7 @@ def _similar(path: Path) -> str:
     """A hint to a recording with a similar name, beside the path or in a folder ``bags``; empty where there is none."""
     files = [each for folder in (path.parent, path.parent / "bags") for each in folder.glob("*/*.mcap")]
     known = {each.parent.name: each.parent for each in files}
-    similar = get_close_matches(path.name, known, n=1)
+    similar = get_close_matches(path.name, known, n=1, cutoff=0.7)
     return f"; did you mean '{known[similar[0]]}'?" if similar else ""
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import ctypes
 import os
+import socket
 import subprocess
 import sys
 import time
@@ -83,6 +84,12 @@ def environment(variables: Mapping[str, str]) -> Iterator[Finding]:
     else:
         peers = variables.get("ROS_STATIC_PEERS") or ("none" if reach == "LOCALHOST" else "those of the network")
         yield Finding(OK, f"{domain}discovery range {reach}, other machines: {peers}")
+    for peer in filter(None, variables.get("ROS_STATIC_PEERS", "").split(";")):
+        try:
+            socket.getaddrinfo(peer, None)
+        except OSError:
+            remedy = "export ROS_STATIC_PEERS='192.168.0.2;192.168.0.3', with the other computers' addresses"
+            yield Finding(PROBLEM, f"ROS_STATIC_PEERS has {peer!r}, which is no address and no known name", remedy)
     for name in ("ROS_LOCALHOST_ONLY", "ROS_DISCOVERY_SERVER", *_FAST_DDS):
         if variables.get(name):
             remedy = f"unset {name}, or set it alike in every shell"

@@ -506,7 +506,8 @@ class GraphNode(BatchNode):
         """Count and log a message that is not used."""
         self.monitor.totals[what] += 1
         self.monitor.last_reason = f"{topic}: {reason}"
-        self.log_throttled(f"{what} {topic}", f"{topic}: {what} message ignored: {reason}")
+        ignored = f" {what} message ignored:" if topic.startswith("/") else ""  # timers and services have none
+        self.log_throttled(f"{what} {topic}", f"{topic}:{ignored} {reason}")
 
     def log_throttled(self, key: str, text: str, period_s: float = _LOG_PERIOD_S) -> None:
         """Warn at most once per key and period."""

@@ -161,7 +161,7 @@ def options_for(args: argparse.Namespace, found: Mapping[str, Value] = MappingPr
             raise UpError(f"{args.bag}: {error}") from error
         if not options["played"]:
             advice = advice_for(types)
-            what = f"no topic /<sensor>/skeleton; it has {', '.join(sorted(topics)) or 'none'}"
+            what = f"no topic /<sensor>/skeleton; {graph.listed(topics)}"
             raise NoSourceError(f"{args.bag}: {what}{f'; {advice}' if advice else ''}")
     return options
 

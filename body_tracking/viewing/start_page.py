@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -169,10 +170,10 @@ class StartPage:
             self._parts = []
             for each in self._listed:
                 name = html.escape(each.path.name)
-                said = f"<b>{name}</b> {html.escape(each.where)}: {html.escape(each.content)}"
+                said = f"<b>{name}</b> {html.escape(each.where)}: {_whole_options(each.content)}"
                 self._parts.append(gui.add_divider())
                 if each.refusal:
-                    self._parts.append(gui.add_html(block([line(GREY, "", f"{said}. {html.escape(each.refusal)}")])))
+                    self._parts.append(gui.add_html(block([line(GREY, "", f"{said}. {_whole_options(each.refusal)}")])))
                     continue
                 self._parts.append(gui.add_html(block([said])))
                 button: Any = gui.add_button(f"play {each.path.name}")
@@ -210,3 +211,8 @@ class StartPage:
     def _on_open(self) -> None:
         if self._path.value.strip():
             self._choose(self._choice(Path(self._path.value.strip()).expanduser()))
+
+
+def _whole_options(text: str) -> str:
+    """A text in HTML whose options are not broken at a hyphen."""
+    return re.sub(r"--[a-z-]+", r"<span style='white-space:nowrap'>\g<0></span>", html.escape(text))

@@ -32,6 +32,7 @@ def worst(findings: Iterable[Finding]) -> tuple[str, str]:
         ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, OK, "range SUBNET, other machines: those of the network"),
         ({"ROS_DOMAIN_ID": "7", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}, OK, "7, discovery range LOCALHOST"),
         ({"ROS_STATIC_PEERS": "10.0.0.2"}, OK, "other machines: 10.0.0.2"),
+        ({"ROS_STATIC_PEERS": "10.0.0.2;10.0.0.x"}, PROBLEM, "has '10.0.0.x', which is no address"),
         ({"ROS_DOMAIN_ID": "lab"}, PROBLEM, "'lab'"),
         ({"ROS_DOMAIN_ID": "233"}, PROBLEM, "0 to 232"),
         ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"}, PROBLEM, "do not find each other"),

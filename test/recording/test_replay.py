@@ -352,12 +352,11 @@ def test_a_recording_without_skeletons_is_refused_with_the_options_for_it(tmp_pa
 
 
 def test_a_sensor_that_a_recording_lacks_is_refused_with_those_that_it_has(tmp_path: Path, command: Command) -> None:
-    """All its topics only where it has no such sensor; an inertial sensor in the form of the option ``--imus``."""
+    """All its topics but the truth, only where it has no such sensor; an inertial sensor in the form of ``--imus``."""
     five, coloured, out = BAG.with_name("five_systems"), BAG.with_name("camera_reaching"), ("-o", tmp_path / "out")
     turning = BAG.with_name("cameras_turning")
     worn = "forearm_left, forearm_right, pelvis, upper_arm_left, upper_arm_right, upper_trunk"
-    with BagReader(BAG) as reader:
-        listed = ", ".join(sorted(reader.topics))
+    listed = "/kinect1/skeleton, /kinect2/skeleton"
     for words, said in (
         (("replay", five, *out, "--sensors", "kinect1,kinect9"), "kinect9/skeleton; its sensors are kinect1, kinect2"),
         (("calibrate", five, "--sensors", "kinect9"), "/kinect9/skeleton; its sensors are kinect1, kinect2"),
