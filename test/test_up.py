@@ -35,7 +35,7 @@ from body_tracking.pipeline.roles import ROLES  # noqa: E402
 from body_tracking.pipeline.system import Options  # noqa: E402
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagReader, BagWriter, deserialize  # noqa: E402
 from body_tracking.ros import discovery  # noqa: E402
-from body_tracking.ros.up import options_for  # noqa: E402
+from body_tracking.ros.up import arguments_from, options_for, without_effect  # noqa: E402
 from body_tracking.systems import options_of  # noqa: E402
 from domains import domain  # noqa: E402
 from excerpts import beginning  # noqa: E402
@@ -320,6 +320,20 @@ def test_a_parameters_file_with_a_mistake(
     line = refusal(capsys, "--bag", BAG, "--params-file", file)
     assert str(file) in line
     assert said in line
+
+
+def test_options_without_effect_are_named(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    markers, setup = BAG.with_name("markers_arm"), BAG.parents[1] / "config" / "marker_setup"
+    given = [f"--bag={markers}", f"--marker-setup={setup}", "--filter=ekf", "--convention=isb"]
+    args = arguments_from([*given, "--sensors=none", "--marker-images=render"])
+    found = without_effect(args, systems.nodes_for(options_for(args)))
+    assert found == ["--marker-images", "--filter", "--convention"]
+    args = arguments_from([f"--bag={BAG}", "--filter=ekf", "--convention=isb"])
+    assert not without_effect(args, systems.nodes_for(options_for(args)))
+    (tmp_path / "targets.yaml").touch()
+    assert "; without cameras, --marker-points names" in refusal(
+        capsys, "--sensors", "none", "--marker-setup", tmp_path
+    )
 
 
 def test_other_mistakes_on_the_command_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -20,13 +20,14 @@ class SetupError(BodyTrackingError):
     """Raised when no folder is given or it lacks a file."""
 
 
-def file_of(folder: object, name: str, made_by: str) -> Path:
+def file_of(folder: object, name: str, made_by: str, else_do: str = "") -> Path:
     """A file of the folder.
 
     Args:
         folder: the parameter ``setup``.
         name: one of the three.
         made_by: the command that writes it, for the error message.
+        else_do: end of the message: how to do without the file.
 
     Raises:
         SetupError: no folder, or no such file in it.
@@ -35,7 +36,7 @@ def file_of(folder: object, name: str, made_by: str) -> Path:
         raise SetupError("setup: no folder given; it has to hold rig.yaml, targets.yaml and chain.yaml")
     path = Path(str(folder)).expanduser() / name
     if not path.is_file():
-        raise SetupError(f"{path}: no such file; body_tracking markers {made_by} makes it")
+        raise SetupError(f"{path}: no such file; body_tracking markers {made_by} makes it{else_do}")
     return path
 
 
@@ -45,7 +46,7 @@ def camera_names(folder: Path) -> tuple[str, ...]:
     Raises:
         SetupError: no folder, or no such file in it, or it names no cameras.
     """
-    path = file_of(folder, RIG, "calibrate")
+    path = file_of(folder, RIG, "calibrate", "; without cameras, --marker-points names the topic of the points")
     try:
         return tuple(camera_name(str(each["frame"])) for each in files.read_yaml(path)["cameras"])
     except files.FileError as error:

@@ -342,7 +342,8 @@ def check(args: argparse.Namespace) -> int:
         joints = load_chain(args.setup / setup.CHAIN).joints
         report["joints"] = {each.name: each.kind.value for each in joints}
         lines.append(f"joints: {', '.join(f'{each.name} ({each.kind.value})' for each in joints)}")
-        lines.append(f"whole: body_tracking up --marker-setup {args.setup}")
+        points = " --marker-points TOPIC" if rig is None else ""
+        lines.append(f"whole: body_tracking up --sensors none --marker-setup {args.setup}{points}")
     else:
         report["joints"] = {}
         lines.append(

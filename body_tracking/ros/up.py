@@ -600,6 +600,14 @@ def flags(options: Mapping[str, Value]) -> Iterator[str]:
             yield f"--{name.replace('_', '-')} {text}".rstrip()
 
 
+def without_effect(args: argparse.Namespace, specs: Sequence[NodeSpec]) -> list[str]:
+    """The options of a command line that change nothing in a graph of these nodes."""
+    found = ["--marker-images"] if args.marker_images and args.bag is not None else []
+    if not any(spec.executable == "joint_angles" for spec in specs):  # of markers alone
+        found += [f"--{name}" for name in ("filter", "convention", "lag") if getattr(args, name)]
+    return found
+
+
 def run(args: argparse.Namespace) -> int:
     """``body_tracking up``."""
     found: Mapping[str, Value] = {}
@@ -634,6 +642,8 @@ def supervise(
         print(f"{options['calibration']}: only loaded, as a bag plays", flush=True)
     if note := unused_imus(options):
         print(f"note: {note}", flush=True)
+    if unheard := without_effect(args, specs):
+        print(f"note: without effect here: {', '.join(unheard)}", flush=True)
     if args.bag is not None:
         with RigReader(args.bag) as reader:
             others = unused({name: each.type_name for name, each in reader.topics.items()}, options)
