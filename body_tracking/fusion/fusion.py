@@ -40,7 +40,10 @@ _WIDTHS = ((0.15, 0.6), (0.05, 0.4))
 """Plausible (least, greatest) lengths of the left-right axes of shoulders and hips, as a Kinect sees them, metres."""
 
 MAX_OUTPUT_GAP = round(0.065 * NANOSECONDS)
-"""Silence of the reference from which outputs are made at another sensor's frames, nanoseconds."""
+"""Time without an output after which one is made at another sensor's frame, nanoseconds."""
+
+SHARE_OF_PERIOD = 0.75
+"""Least time between such outputs while the reference is silent, in its periods: of two others one leads."""
 
 EXTRAPOLATE = 0.05
 """Longest time by which a sensor's older frame is carried forward, seconds."""
@@ -231,7 +234,7 @@ class Fusion(PlacedSensors[_Sensor]):
         while self._pending:
             stamp, other, deadline = self._pending[0]
             # Another sensor's frame gives an output only when the reference has been silent for a while.
-            if other and stamp - self._last_output(stamp) <= MAX_OUTPUT_GAP:
+            if other and stamp - self._last_output(stamp) <= self._least_gap(stamp):
                 del self._pending[0]
                 continue
             due = self._due(stamp)
@@ -244,6 +247,13 @@ class Fusion(PlacedSensors[_Sensor]):
             if skeleton is not None:
                 fused.append(skeleton)
         return fused
+
+    def _least_gap(self, stamp: int) -> int:
+        """Time since the last output that a frame of another sensor than the reference needs for the next one."""
+        reference = self._sensors[self.reference]
+        if not reference.frames or stamp - reference.frames[-1].stamp_ns <= self.parameters.silence * NANOSECONDS:
+            return MAX_OUTPUT_GAP
+        return round(SHARE_OF_PERIOD * reference.rhythm.period * NANOSECONDS)
 
     def _last_output(self, stamp: int) -> int:
         """Time of the last output or, at the start, of the first frame."""
