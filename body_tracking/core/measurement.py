@@ -85,18 +85,19 @@ def joint_correlation(of_bones: float = BONE_CORRELATION) -> FloatArray:
     )
 
 
-def offset_correlation(of_bones: float = BONE_CORRELATION) -> FloatArray:
+def offset_correlation(of_bones: float = BONE_CORRELATION, of_girdles: float = GIRDLE_CORRELATION) -> FloatArray:
     """(25, 25) correlation of the joints' constant offsets from the anatomical joints.
 
-    :data:`GIRDLE_CORRELATION` between the shoulders and between the hips, as in :func:`joint_correlation` within a
-    limb. None between the spine's joints and others: a camera may place a part of the spine in front of or behind
-    shoulders and hips, as if the person bent (with correlated ones simulated people bend by 9 instead of 3 degrees).
+    ``of_girdles`` between the shoulders and between the hips, as in :func:`joint_correlation` within a limb. None
+    between the spine's joints and others: a camera may place a part of the spine in front of or behind shoulders and
+    hips, as if the person bent (with correlated ones simulated people bend by 9 instead of 3 degrees).
 
     Args:
         of_bones: correlation of the two joints of a limb's bone, from 0 (independent) to less than 1.
+        of_girdles: correlation of the left and the right joint, from 0 to less than 1.
     """
     sides = ("_LEFT", "_RIGHT")
-    pairs = [(Joint[f"{name}_LEFT"], Joint[f"{name}_RIGHT"], GIRDLE_CORRELATION) for name in ("SHOULDER", "HIP")]
+    pairs = [(Joint[f"{name}_LEFT"], Joint[f"{name}_RIGHT"], of_girdles) for name in ("SHOULDER", "HIP")]
     limbs = [
         (start, end, of_bones)
         for start, end in BONES

@@ -15,6 +15,7 @@ from body_tracking.filters.ekf.sources import Sources
 from body_tracking.filters.ekf.state import Measurement, SensorState, State, StateSpace
 
 _DIMENSIONS = 3
+_EYE3 = np.eye(3)
 _MEAN = np.full(_DIMENSIONS, 1.0 / _DIMENSIONS)
 _FIRST_WHITE = 0.01
 """Metres: standard deviation of a sensor's white noise before it is learnt."""
@@ -38,6 +39,9 @@ STRETCH = 0.067
 _BESIDE_ORIENTATIONS = 3.0
 """With orientations, least variance of a camera's slow errors as a multiple of the variance that it states: without
 them, its constant errors are explained by a body of other proportions."""
+_SLOW_BONE_CORRELATION = 0.7
+"""Correlation of the slow errors of the two joints of a limb's bone beside orientations, where that of the joints'
+offsets is not smaller: only a part of the slow errors is due to offsets (docs/tried.md, "Sensors on one arm")."""
 _ALONE = 0.1
 """Factor on the parameter ``slow_scale`` for a single sensor: without it, average segment lengths outweigh the person's
 in the first seconds, and elbows err by 10 instead of 6 degrees (``benchmarks/kinect_vs_vicon.py``)."""
@@ -73,9 +77,12 @@ class SensorErrors:
         self._space, self._model, self._parameters = space, space.model, parameters
         self._limbs = tuple(f"{part}_{side}" for part in ("upper_arm", "forearm") for side in ("left", "right"))
         self.carried = self._limb_table()
-        joints = space.model.joints
-        self._girdles = np.linalg.cholesky(offset_correlation(0.0)[np.ix_(joints, joints)])
-        self._girdles_of_axes = np.kron(self._girdles, np.eye(3))
+        joints = np.ix_(space.model.joints, space.model.joints)
+        of_bones = min(_SLOW_BONE_CORRELATION, parameters.bone_correlation)
+        self._of_limbs: FloatArray = np.linalg.cholesky(offset_correlation(of_bones, 0.0)[joints]).astype(np.float64)
+        self._of_limbs_and_girdles: FloatArray = np.linalg.cholesky(offset_correlation(of_bones)[joints]).astype(
+            np.float64
+        )
         self.slow_size = 3 * space.points + len(self._limbs)
 
     def unknown(self, measurement: Measurement, alone: bool = False) -> SensorState:
@@ -179,8 +186,9 @@ class SensorErrors:
             return _kept(sensor.slow, max(sensor.slow, least)), sensor.slow_estimate, sensor.slow_information
         scaled, _ = _slow_parts(sensor, measurement)
         half = whitening * np.sqrt(scaled).repeat(3)[rows]
-        if self._paired(sources):
-            half = half @ self._girdles_of_axes[rows]
+        correlated = self._correlated(sources)
+        if correlated is not None:
+            half = half @ np.kron(correlated, _EYE3)[rows]
         gram = half.T @ half
         score = 0.5 * float(((white @ half) ** 2 - gram.diagonal()).sum())
         information = 0.5 * float((gram * gram).sum())
@@ -215,7 +223,8 @@ class SensorErrors:
         """
         stddev = np.sqrt(self.slow_variance(sensor, measurement))
         stretch = STRETCH if sensor.stated else 0.0
-        own = stddev[:, None] * self._girdles if self._paired(sources) else np.diag(stddev)
+        correlated = self._correlated(sources)
+        own = np.diag(stddev) if correlated is None else stddev[:, None] * correlated
         return own, np.full(len(self._limbs), stretch)
 
     @staticmethod
@@ -224,16 +233,17 @@ class SensorErrors:
         scaled, rest = _slow_parts(sensor, measurement)
         return sensor.slow * scaled + rest
 
-    @staticmethod
-    def _paired(sources: Sources) -> bool:
-        """Whether the slow errors of the two shoulders, and those of the hips, are correlated.
+    def _correlated(self, sources: Sources) -> FloatArray | None:
+        """(19, 19) Cholesky factor of the correlation of the points' slow errors; None if they are independent.
 
-        That is beside orientations of limbs alone: slow errors are large then (``_BESIDE_ORIENTATIONS``), and
-        independent ones would hide how a person twists (20 instead of 11 degrees off in a recording with sensors on one
-        arm). With cameras alone real arms err by 5.1 instead of 4.8 and 6.5 instead of 5.9 degrees with correlated
-        ones (``benchmarks/kinect_vs_vicon.py``), and sensors on the trunk measure the twist themselves.
+        Beside orientations slow errors are large (``_BESIDE_ORIENTATIONS``). Independent ones would hide the directions
+        of arms, and, where no sensor on the trunk measures it, how a person twists (20 instead of 11 degrees off in a
+        recording with sensors on one arm). With cameras alone real arms err by 5.1 instead of 4.8, and 6.5 instead of
+        5.9, degrees with correlated ones (``benchmarks/kinect_vs_vicon.py``).
         """
-        return bool(sources.names) and bool((sources.segments > _UPPER_TRUNK).all())
+        if not sources.names:
+            return None
+        return self._of_limbs_and_girdles if (sources.segments > _UPPER_TRUNK).all() else self._of_limbs
 
     def place_of(self, state: State, sensor: str) -> int:
         """First column of a sensor's slow errors in ``State.crosses``."""
