@@ -109,6 +109,9 @@ class Fusion(PlacedSensors[_Sensor]):
         parameters: see :class:`FusionParameters`.
         reference: the sensor whose clock is the output's and at whose frames it is made; the first one when None.
         world: the frame of the output.
+
+    Attributes:
+        behind: by sensor, seconds by which its last frame was older than the newest output when it arrived.
     """
 
     def __init__(
@@ -135,6 +138,7 @@ class Fusion(PlacedSensors[_Sensor]):
         self._rejected_since: dict[str, FloatArray] = {name: np.full(N_JOINTS, np.nan) for name in self._sensors}
         self._rejecting = False
         self._sides = Sides()
+        self.behind: dict[str, float] = {}
 
     def forget(self) -> None:
         """Forget all frames, because the next ones are of another person."""
@@ -176,6 +180,8 @@ class Fusion(PlacedSensors[_Sensor]):
             self._restart_behind(stamp, now_ns)
         if skeleton.covariances is not None:  # not a Kinect, which states none
             self._sides.reliable.add(sensor)
+        if self._last_ns is not None:
+            self.behind[sensor] = (self._last_ns - stamp) / NANOSECONDS
         # Frames are stored before the sensor is calibrated, so that its frame period is known by then.
         self._remember(source, skeleton, stamp)
         if source.pose(stamp) is None:

@@ -130,13 +130,24 @@ class FusionStage(Stage):
         self._trunk_up, self._trunk_ns = 0.0, 0
 
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
-        if self._trunk_up > _UPSIDE_DOWN:
-            return 0, "", dict(self.counters)
-        text = (
-            f"the person is upside down in {self.values['world_frame']}: are the axes of the skeletons those of an "
-            "optical frame (x right, y down, z forward), and is calibration's reference_roll right?"
+        return int(bool(text := self._problem())), text, dict(self.counters)
+
+    def _problem(self) -> str:
+        """What is wrong with the frames; empty if nothing is."""
+        if self._trunk_up <= _UPSIDE_DOWN:
+            return (
+                f"the person is upside down in {self.values['world_frame']}: are the axes of the skeletons those of an "
+                "optical frame (x right, y down, z forward), and is calibration's reference_roll right?"
+            )
+        silence = self._fusions[0].parameters.silence
+        behind = {name: lag for each in self._fusions for name, lag in each.behind.items() if lag > silence}
+        if not behind:
+            return ""
+        lags = ", ".join(f"{name} ({lag:.2f} s)" for name, lag in sorted(behind.items()))
+        return (
+            f"not used, as its frames arrive later than another sensor's by more than silence ({silence:g} s): {lags}; "
+            "check its clock and its network"
         )
-        return 1, text, dict(self.counters)
 
     @property
     def counters(self) -> Mapping[str, int]:

@@ -18,11 +18,15 @@ from two_kinects import FRAME, OFFSET, OFFSET_NS, POSES, truth
 from body_tracking.calibration.online import OnlineCalibration
 from body_tracking.core.clocks import ClockModel
 from body_tracking.core.measurement import COMMON_SHARE, left_right_axes
+from body_tracking.core.parameters import check_all
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton
 from body_tracking.fusion.fusion import Fusion, FusionParameters
 from body_tracking.fusion.placement import FusionError
 from body_tracking.fusion.sides import HOLD, MIN_HOLD
+from body_tracking.fusion.stage import FusionStage
 from body_tracking.kinect.csv_recording import CsvRecording
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.stage import Now
 from draws import draws, some
 from walkers import TRACKED, about_y, frame
 
@@ -218,6 +222,21 @@ def test_a_silent_sensor_is_dropped_within_a_tenth_of_a_second_and_faded_in_agai
     assert_allclose(wrong[stamps > 5.0], always[stamps > 5.0], atol=0.002)
     # ... gently.
     assert np.abs(np.diff(wrong[(stamps > 4.0) & (stamps < 4.6)])).max() < 0.012
+
+
+@pytest.mark.parametrize(("late", "lag"), [("kinect1", 0.3), ("kinect2", 0.3), ("kinect1", 0.05)])
+def test_a_sensor_whose_frames_arrive_too_late_is_named(late: str, lag: float) -> None:
+    stage = FusionStage(check_all(FusionStage.PARAMETERS, {"sensors": ("kinect1", "kinect2")}))
+    for pose in POSES.values():
+        list(stage.take(graph.CALIBRATION, pose, Now(0, 0)))
+    list(stage.take(graph.CALIBRATION_CLOCK, ("kinect2", 0, ClockModel(OFFSET_NS)), Now(0, 0)))
+    arriving = [(at + round(lag * NANOSECONDS) * (name == late), name, seen) for name, seen, at in frames(3.0)]
+    for at, name, seen in sorted(arriving, key=lambda each: each[0])[:150]:  # both still come
+        list(stage.take(graph.skeleton_topic(name), (seen,), Now(at, at)))
+        list(stage.poll(at))
+    level, text, _ = stage.state(0)
+    assert level == (lag > 0.1)
+    assert (f"later than another sensor's by more than silence (0.1 s): {late} (0.3" in text) == (lag > 0.1)
 
 
 def test_output_continues_while_the_reference_is_silent() -> None:
