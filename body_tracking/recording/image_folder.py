@@ -119,7 +119,14 @@ def import_folder(
         raise ImageFolderError(f"{folder}: {numbers}, whose names are no stamps: which belong together?")
     info = _read_info(folder / "camera_info.yaml", frame)
     infos = {names.colour_info: info}
-    if depth:
+    _check_size(folder / "camera_info.yaml", info, next(iter(colour.values())))
+    if not depth:
+        others = sorted(
+            path.name for path in folder.iterdir() if path.name.lower().startswith("depth") and path.is_dir()
+        )
+        if others:
+            raise ImageFolderError(f"{folder / others[0]}: no depth images; they are taken from the folder 'depth'")
+    else:
         infos[names.depth_info] = _depth_info(folder, info, next(iter(depth.values())))
     images = [
         *((stamp_ns, names.colour + COMPRESSED, path) for stamp_ns, path in colour.items()),
@@ -198,6 +205,20 @@ def _read_info(path: Path, frame: str) -> Camera:
         raise ImageFolderError(f"{path}: {error.args[0]} is missing") from error
     except (AttributeError, TypeError, ValueError, CameraError) as error:
         raise ImageFolderError(f"{path}: {error}") from error
+
+
+def _check_size(path: Path, info: Camera, first: Path) -> None:
+    """Refuse intrinsics of another size than the first colour image."""
+    data = _data(first)
+    _form(first, data)  # OpenCV would print a warning about a truncated image
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    if pixels is None:
+        raise ImageFolderError(f"{first}: damaged")
+    if pixels.shape != (info.height, info.width):
+        height, width = pixels.shape
+        raise ImageFolderError(
+            f"{path}: of images of {info.width}x{info.height} pixels, {first.name} has {width}x{height}"
+        )
 
 
 def _numbers(content: Mapping[str, Any], key: str) -> Any:

@@ -133,6 +133,11 @@ def _list_as_matrix(images: Path) -> None:
             lambda images: info(images).write_text("- 1\n"),
             "camera_info.yaml: no intrinsics as ROS's camera_calibration writes them",
         ),
+        (
+            lambda images: info(images).write_text(info(images).read_text().replace("width: 64", "width: 128")),
+            r"camera_info.yaml: of images of 128x48 pixels, 1305031102\.175304\.png has 64x48",
+        ),
+        (lambda images: (images / "depth").rename(images / "Depth"), "Depth: no depth images; they are taken from"),
         (_list_as_matrix, "camera_info.yaml: camera_matrix: expected rows, cols and data"),
     ],
 )
