@@ -209,8 +209,10 @@ class StartPage:
         return Choice(bag, bool(self._loop.value), str(self._filter.value), str(self._convention.value))
 
     def _on_open(self) -> None:
-        if self._path.value.strip():
-            self._choose(self._choice(Path(self._path.value.strip()).expanduser()))
+        if path := self._path.value.strip():
+            self._choose(self._choice(Path(path).expanduser()))
+        else:
+            self.say("Write the path of a recording into the field above the button first.", RED)
 
 
 def _whole_options(text: str) -> str:

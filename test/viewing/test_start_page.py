@@ -34,3 +34,14 @@ def test_the_page_is_not_ready_while_another_graph_runs() -> None:
         page.say("wave has ended; choose again.", GREEN)
         page.draw_domain("", (), False, "none")
         assert "wave has ended" in page._state.content
+
+
+def test_a_recording_elsewhere_needs_a_path() -> None:
+    chosen: list[Choice] = []
+    with StartPage("127.0.0.1", 18080, FILTERS, CONVENTIONS, chosen.append) as page:
+        page._path.value = " "
+        page._on_open()
+        assert not chosen and "path of a recording" in page._state.content
+        page._path.value = " wave "
+        page._on_open()
+    assert [each.bag for each in chosen] == [Path("wave")]
