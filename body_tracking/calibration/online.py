@@ -23,7 +23,7 @@ from body_tracking.calibration.rigid import CalibrationError
 from body_tracking.calibration.still_pose import FRAMES, is_still, is_t_pose, still_pose_registration
 from body_tracking.calibration.turned import best_estimate, half_turn_from, registration
 from body_tracking.core import so3
-from body_tracking.core.clocks import ClockModel, jumped_back
+from body_tracking.core.clocks import JUMP_BACK_NS, ClockModel, jumped_back
 from body_tracking.core.measurement import joint_variance
 from body_tracking.core.parameters import number_field
 from body_tracking.core.sensor_poses import CalibrationResult, SensorPose, SensorQuality, level_pose
@@ -152,20 +152,25 @@ class _Track:
         self.states: list[np.ndarray] = []
         self.variances: list[FloatArray] = []
         self.delays: list[int] = []  # receipt minus stamp
+        self.least_delay: int | None = None
         self.late = 0
 
-    def push(self, skeleton: Skeleton, received_ns: int) -> bool:
-        """Keep a frame; False when the sensor's clock jumped back."""
+    def push(self, skeleton: Skeleton, received_ns: int) -> str:
+        """Keep a frame, unless the sensor's clock jumped since the last one: returns the direction, else ""."""
         if self.stamps and skeleton.stamp_ns <= self.stamps[-1]:
             self.late += 1
-            return not jumped_back(skeleton.stamp_ns, self.stamps[-1])
+            return "back" if jumped_back(skeleton.stamp_ns, self.stamps[-1]) else ""
+        delay = received_ns - skeleton.stamp_ns
+        if self.least_delay is not None and delay < self.least_delay - JUMP_BACK_NS:
+            return "forward"  # after a mere gap the delay is as before
+        self.least_delay = delay if self.least_delay is None else min(self.least_delay, delay)
         self.stamps.append(skeleton.stamp_ns)
         known = skeleton.valid
         self.positions.append(np.where(known[:, None], skeleton.positions, np.nan))
         self.states.append(np.where(known, skeleton.states, 0))
         self.variances.append(joint_variance(self.positions[-1], self.states[-1], skeleton.covariances))
-        self.delays.append(received_ns - skeleton.stamp_ns)
-        return True
+        self.delays.append(delay)
+        return ""
 
     def forget_before(self, stamp_ns: int) -> None:
         # In steps, because each deletion moves the whole list.
@@ -296,13 +301,13 @@ class OnlineCalibration:
             The results to publish, usually none.
         """
         if sensor == self.reference:
-            if not self._track.push(skeleton, received_ns):
-                self._restart(f"the clock of {sensor} went back: starting again from the calibration so far")
+            if way := self._track.push(skeleton, received_ns):
+                self._restart(f"the clock of {sensor} went {way}: starting again from the calibration so far")
                 self._track.push(skeleton, received_ns)
             return self._advance(skeleton.stamp_ns)
         other = self._sensors.get(sensor)
-        if other is not None and not other.track.push(skeleton, received_ns):
-            self.events.append(f"the clock of {sensor} went back: estimating its offset again")
+        if other is not None and (way := other.track.push(skeleton, received_ns)):
+            self.events.append(f"the clock of {sensor} went {way}: estimating its offset again")
             other.track = _Track()
             other.loaded = None
             other.forget()

@@ -52,11 +52,11 @@ class Placement:
     def to_reference(self, sensor_ns: int) -> int:
         """A stamp of this sensor in the reference's clock, by the relation that is in force then."""
         found = sensor_ns
-        for index, (valid_from_ns, clock) in enumerate(self._clocks):
-            reference_ns = clock.to_reference(sensor_ns)
-            if index > 0 and reference_ns < valid_from_ns:
+        # The newest first: by an older one, a clock that was set back since is never in force.
+        for valid_from_ns, clock in reversed(self._clocks):
+            found = clock.to_reference(sensor_ns)
+            if found >= valid_from_ns:
                 break
-            found = reference_ns
         return found
 
     def stamp(self, sensor_ns: int) -> int | None:

@@ -436,6 +436,21 @@ def test_a_looping_bag_keeps_the_poses_and_adds_no_information_on_the_clock() ->
     assert twice.clocks["kinect2"].offset == pytest.approx(once.clocks["kinect2"].offset, abs=0.001)
 
 
+@pytest.mark.parametrize("sensor", ["kinect1", "kinect2"])
+@pytest.mark.parametrize("step", [-5.0, 5.0])
+def test_a_clock_that_is_set_while_running_is_found_anew(sensor: str, step: float) -> None:
+    calibration = copy.deepcopy(_walked(15.0))
+    before = calibration.result()
+    for name, seen, received in stream(15.0, start=15.0):
+        at = round(step * NANOSECONDS) if name == sensor else 0
+        calibration.push(name, replace(seen, stamp_ns=seen.stamp_ns + at), received)
+    after = calibration.result()
+    assert sum("went" in event for event in calibration.events) == 1
+    expected = 0.4 + (step if sensor == "kinect2" else -step)
+    assert after.clocks["kinect2"].offset == pytest.approx(expected, abs=0.02)
+    assert Rotation.from_matrix(between(after)[0] @ between(before)[0].T).magnitude() < np.radians(1.0)
+
+
 @pytest.mark.slow
 def test_a_clock_that_drifts_far_is_followed() -> None:
     """Beyond the search range of the windows of motion; the estimate so far becomes the prior."""

@@ -105,6 +105,8 @@ def test_a_sensor_with_a_wrong_clock_is_left_out_until_it_is_calibrated(off: flo
         time = 10.0 + number * FRAME
         pushed(made, "kinect1", seen("kinect1", time))
         other = seen("kinect2", time + 0.011)
+        if number == 10:  # a refined clock
+            made.set_clock("kinect2", round(time * NANOSECONDS), ClockModel(OFFSET_NS + 1_000_000))
         if number >= 20:
             other = replace(other, stamp_ns=other.stamp_ns + round(off * NANOSECONDS))
         if number == 40:
