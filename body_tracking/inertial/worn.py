@@ -27,6 +27,8 @@ UNKNOWN_HEADING: Final = np.pi**2 / 3.0
 """rad2: variance of a heading that is uniform over a turn."""
 _OTHER_FRAME = 50
 """Readings of another frame in a row after which that frame is accepted."""
+_FROZEN_NS = round(0.3 * NANOSECONDS)
+"""A reading that is repeated for longer is no longer used."""
 _SPACING_NS = NANOSECONDS // 55
 """Least time between readings in the history: 50 per second are enough."""
 _STATED: Final = np.diag([0.03, 0.03, 0.1]) ** 2
@@ -113,6 +115,8 @@ class WornSensor:
         self._turned = 0.0
         self.has_field = False
         self._field_known = False
+        self._values: FloatArray = np.empty(0)
+        self._changed_ns = 0
         self.clock.reset()
 
     @property
@@ -143,6 +147,9 @@ class WornSensor:
         """
         self._check_frame(sample.frame_id)
         self.counters["readings"] += 1
+        if self._is_frozen(sample, received_ns):
+            self.counters["frozen"] += 1
+            return None
         if sample.orientation is None and self._oriented_ns is not None:
             if sample.stamp_ns - self._oriented_ns < OUTAGE_S * NANOSECONDS:
                 return None
@@ -214,6 +221,18 @@ class WornSensor:
             self._begin()
             self.growth = UNKNOWN_HEADING
         self._frame, self._strange = frame, 0
+
+    def _is_frozen(self, sample: ImuSample, received_ns: int) -> bool:
+        """Whether a driver has repeated one reading for a while, as no worn sensor does; it then counts as silent."""
+        rate, force = sample.angular_velocity, sample.acceleration
+        if rate is None or force is None:
+            return False
+        given = (rate, force) if sample.orientation is None else (rate, force, sample.orientation)
+        values = np.concatenate(given)
+        if np.array_equal(values, self._values):
+            return received_ns - self._changed_ns > _FROZEN_NS
+        self._values, self._changed_ns = values, received_ns
+        return False
 
     def _receive(self, sample: ImuSample, received_ns: int) -> None:
         """Update the clock, and count outages."""

@@ -22,7 +22,7 @@ from body_tracking.inertial.mounting import mountings
 from body_tracking.inertial.parameters import TrackingParameters
 from body_tracking.inertial.simulated import Slip
 from body_tracking.inertial.tracking import InertialTracker, InertialTrackingError, TrackerOutput
-from body_tracking.inertial.worn import ReceiptClock
+from body_tracking.inertial.worn import ReceiptClock, WornSensor
 from body_tracking.simulation.scene import START_NS
 from draws import draws
 
@@ -107,6 +107,23 @@ def test_a_sensor_that_is_switched_off_is_named_and_comes_back() -> None:
         error, stddev = fed.errors("forearm_right", 9.5)
         assert ((np.abs(error) < np.radians(10.0)) | (np.abs(error) < 2.0 * stddev)).mean() > 0.95
     assert covered(fed, "forearm_left", 4.0).mean() > 0.95
+
+
+def test_a_driver_that_repeats_one_reading_counts_as_silent() -> None:
+    sensor, rng = WornSensor("forearm_left"), np.random.default_rng(0)
+    for oriented in (False, True):
+        used, values = [], np.zeros(6)
+        for k in range(300):
+            if not 100 <= k < 200:
+                values = rng.normal(scale=0.02, size=6)
+            stamp_ns = (10 * oriented + 1) * NANOSECONDS + k * NANOSECONDS // 50
+            quaternion = np.array([0.0, 0.0, 0.0, 1.0]) if oriented else None
+            sample = ImuSample(stamp_ns, "a", quaternion, None, values[:3], values[3:] + [0.0, 0.0, 9.81])
+            used.append(sensor.take(sample, stamp_ns) is not None)
+        assert all(used[50:100])
+        assert used[100:200] == [True] * 15 + [False] * 85
+        assert all(used[250:])
+    assert sensor.counters["frozen"] == 2 * 85
 
 
 def test_a_slip_by_20_degrees_is_named() -> None:
@@ -230,8 +247,8 @@ def output_later(
     skeleton: bool = True,
 ) -> TrackerOutput:
     """The tracker's output for a reading of the left forearm, at a time after a T-pose."""
-    level, up = np.diag([1e-4, 1e-4, 1e-3]), np.array([0.0, 0.0, 9.81])
     stamp_ns += 110 * NANOSECONDS
+    level, up = np.diag([1e-4, 1e-4, 1e-3]), np.array([0.0, 0.0, 9.81 + 1e-12 * (stamp_ns % NANOSECONDS)])  # not frozen
     sample = ImuSample(stamp_ns, "forearm_left", so3.exp(turned), level, rate, None if rate is None else up, None)
     return tracker.add("forearm_left", sample, stamp_ns + 10_000_000, skeleton=skeleton)
 
