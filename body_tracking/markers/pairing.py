@@ -11,6 +11,8 @@ _KEPT: Final = 64
 """Largest number of incomplete sets kept; older ones are dropped."""
 _RECENT, _MANY = 30, 10
 """Number of recent sets that :meth:`FrameSets.problem` examines, and how many of them must lack a camera."""
+_SILENT_NS: Final = 500_000_000
+"""Time without a frame of a camera, while others send, after which it counts as silent, nanoseconds."""
 
 
 class FrameSets(Generic[Frame]):
@@ -33,11 +35,11 @@ class FrameSets(Generic[Frame]):
         self._last_ns: int | None = None
         self.incomplete = self.late = 0
         self._recent: deque[tuple[str, ...]] = deque(maxlen=_RECENT)  # the cameras that each set lacked
-        self._newest: dict[str, int] = {}
+        self._newest: dict[str, tuple[int, int]] = {}  # stamp and arrival
 
     def push(self, camera: str, stamp_ns: int, frame: Frame, now_ns: int) -> list[dict[str, Frame]]:
         """Add a frame; returns the sets that it completes, in the order of their stamps."""
-        self._newest[camera] = stamp_ns
+        self._newest[camera] = stamp_ns, now_ns
         if self._last_ns is not None and stamp_ns <= self._last_ns + self._tolerance_ns:
             self.late += 1
             return []
@@ -65,7 +67,7 @@ class FrameSets(Generic[Frame]):
         return min(arrival for _, arrival, _ in self._open) + self._max_wait_ns
 
     def problem(self) -> str:
-        """Name a camera that many of the latest sets lack, and its stamp offset; empty if there is none."""
+        """Name a camera that many of the latest sets lack, and why; empty if there is none."""
         # ignore sets that lack most cameras: there the present camera is the one out of step
         few = [cameras for cameras in self._recent if 2 * len(cameras) <= len(self._cameras)]
         lacking = Counter(camera for cameras in few for camera in cameras)
@@ -77,7 +79,13 @@ class FrameSets(Generic[Frame]):
         other = next((camera for camera in self._cameras if camera != late and camera in self._newest), None)
         if late not in self._newest or other is None:
             return f"{count}: nothing comes from it"
-        apart = (self._newest[late] - self._newest[other]) / 1e6
+        (stamp, arrival), (other_stamp, other_arrival) = self._newest[late], self._newest[other]
+        if other_arrival - arrival > _SILENT_NS:
+            return f"{count}: nothing has come from it for {(other_arrival - arrival) / 1e9:.1f} s"
+        with_it = [cameras for cameras in self._recent if late not in cameras]
+        if with_it and not any(with_it):
+            return f"{count}: some of its images do not come"
+        apart = (stamp - other_stamp) / 1e6
         return f"{count}: its stamps are {abs(apart):.1f} ms {'after' if apart > 0 else 'before'} those of {other}"
 
     def reset(self) -> None:

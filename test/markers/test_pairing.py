@@ -52,6 +52,24 @@ def test_a_camera_that_lags_by_more_than_the_tolerance_makes_no_set() -> None:
         assert not waiting.push("camera1", number * PERIOD_NS + 3 * MS, number, 0)
 
 
+def test_a_camera_that_stops_or_loses_images_is_not_said_to_be_out_of_step() -> None:
+    waiting = sets()
+
+    def said(first: int, last: int, *, every: int) -> str:
+        for number in range(first, last):
+            now = number * PERIOD_NS
+            waiting.push("camera1", now, number, now)
+            if every and number % every == 0:
+                waiting.push("camera0", now, number, now)
+            waiting.poll(now)
+        return waiting.problem()
+
+    assert said(0, 40, every=1) == ""
+    assert said(40, 80, every=2) == "camera0 lacks in 15 of 30 sets of images: some of its images do not come"
+    assert said(80, 180, every=0) == "camera0 lacks in 30 of 30 sets of images: nothing has come from it for 1.6 s"
+    assert said(180, 220, every=1) == ""
+
+
 def test_sets_are_given_in_order() -> None:
     waiting, given_out = sets(), []
     for camera in ("camera0", "camera1"):
