@@ -161,9 +161,10 @@ class WornSensor:
                 self.counters["late or repeated"] += 1
                 return None
             self.counters["clock set back"] += 1
+            refers_to_north = sample.orientation is not None and self.has_field
             self._begin()
             self.clock.add(sample.stamp_ns, received_ns)
-            self.growth = UNKNOWN_HEADING
+            self.growth = 0.0 if refers_to_north else UNKNOWN_HEADING
         self._check_field(sample)
         reading = self._given(sample) if sample.orientation is not None else self._estimated(sample)
         for problem in self._watch.add(sample):

@@ -126,6 +126,19 @@ def test_a_driver_that_repeats_one_reading_counts_as_silent() -> None:
     assert sensor.counters["frozen"] == 2 * 85
 
 
+@pytest.mark.parametrize("magnetometer", [True, False])
+def test_a_clock_set_back_costs_no_heading_that_refers_to_north(magnetometer: bool) -> None:
+    sensor, rng = WornSensor("forearm_left"), np.random.default_rng(0)
+    for k in range(200):
+        received_ns = (100 * NANOSECONDS) + k * NANOSECONDS // 50
+        rate, force = rng.normal(scale=0.02, size=3), np.array([0.0, 0.0, 9.81]) + rng.normal(scale=0.02, size=3)
+        field = np.array([2e-5, 0.0, -4e-5]) if magnetometer else None
+        stamp_ns = received_ns - (10 * NANOSECONDS if k >= 150 else 0)
+        sensor.take(ImuSample(stamp_ns, "a", np.array([0.0, 0.0, 0.0, 1.0]), None, rate, force, field), received_ns)
+    assert sensor.counters["clock set back"] == 1
+    assert (sensor.growth < 0.01) == magnetometer
+
+
 def test_a_slip_by_20_degrees_is_named() -> None:
     slipped = sensor("forearm_right", slips=(Slip(10.0, np.radians([0.0, 20.0, 0.0])),))
     fed = feed(
