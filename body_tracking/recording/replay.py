@@ -56,6 +56,8 @@ class ReplayError(BodyTrackingError):
     """Raised when the bag lacks the input of the graph."""
 
 
+_MANY: Final = 0.02
+"""Share of the filter's measurements of which a warning tells that they were not used."""
 OFFLINE: Final[Mapping[str, Value]] = {"deadline": 10.0}
 """Time limits of the stages, seconds: with those of a live graph, offline results would depend on the machine; with
 1 s a busy one lost a frame."""
@@ -291,6 +293,7 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
         counters |= Counter(written.counters)  # both halves may have counted the same message
         states = {node: stage.state(bag.end_ns) for node, stage in first.items()}
         problems = [f"{node}: {text}" for node, (level, text, _) in states.items() if level and text]
+        problems += _too_late(counters)
         if not written.frames:
             given = ", ".join(settings.sensors or sources)
             said = "; ".join(problems) or _listed(+counters)
@@ -320,6 +323,14 @@ def _without(settings: ReplaySettings, bag: BagReader) -> bool:
     if settings.sensors or not settings.other_sources:
         return False
     return bool(settings.options()["computed"]) or not graph.sensors_among(bag.topics)
+
+
+def _too_late(counters: Mapping[str, int]) -> list[str]:
+    """A warning where ``ekf`` left out many measurements because they were recorded too late."""
+    late = counters.get("filter too_late", 0)
+    if late <= _MANY * sum(counters.get(f"filter {name}", 0) for name in ("frames", "orientations")):
+        return []
+    return [f"skeleton_filter: {late} measurements came more than 0.2 s (late_window) late and were not used"]
 
 
 def _filters_in(diagnostics: bytes) -> list[str]:

@@ -266,6 +266,29 @@ def test_where_all_sensors_fall_silent_the_extended_filter_predicts(tmp_path: Pa
     assert min(later) > soon[-1]
 
 
+def test_measurements_that_come_too_late_are_named(tmp_path: Path) -> None:
+    """Frames of one sensor on a network that becomes slow."""
+    with BagReader(BAG) as bag:
+        known = {topic: bag.topics[topic].type_name for topic in bag.topics if topic.startswith("/kinect")}
+        slow_ns, end_ns = bag.start_ns + 5 * NANOSECONDS, bag.start_ns + 7 * NANOSECONDS
+        messages = [raw for raw in bag.messages(list(known)) if raw.log_time_ns < end_ns]
+    late = {
+        id(raw): raw.log_time_ns
+        + round(0.3 * NANOSECONDS) * (raw.topic == "/kinect2/skeleton" and raw.log_time_ns > slow_ns)
+        for raw in messages
+    }
+    with BagWriter(tmp_path / "late") as writer:
+        for topic, kind in known.items():
+            writer.add_topic(topic, kind)
+        for raw in sorted(messages, key=lambda raw: late[id(raw)]):
+            writer.write(raw.topic, raw.cdr, late[id(raw)])
+    report = replay(tmp_path / "late", tmp_path / "out", ReplaySettings(filter_name="ekf"))
+    count = report.counters["filter too_late"]
+    assert count > 40
+    expected = f"skeleton_filter: {count} measurements came more than 0.2 s (late_window) late and were not used"
+    assert report.warnings == (expected,)
+
+
 def elbows(bag_path: Path) -> tuple[FloatArray, FloatArray]:
     """(2, n) radians each: estimated flexion of the elbows, NaN where unknown, and the true one."""
     with BagReader(bag_path) as bag:
