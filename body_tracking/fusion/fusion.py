@@ -43,7 +43,8 @@ MAX_OUTPUT_GAP = round(0.065 * NANOSECONDS)
 """Time without an output after which one is made at another sensor's frame, nanoseconds."""
 
 SHARE_OF_PERIOD = 0.75
-"""Least time between such outputs while the reference is silent, in its periods: of two others one leads."""
+"""The same while the reference is silent, in its periods: with 0.75 every frame of one other sensor gives an output, of
+two others not each (14 outputs a second with :data:`MAX_OUTPUT_GAP`, 27 with this)."""
 
 EXTRAPOLATE = 0.05
 """Longest time by which a sensor's older frame is carried forward, seconds."""

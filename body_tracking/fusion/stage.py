@@ -141,12 +141,10 @@ class FusionStage(Stage):
             )
         silence = self._fusions[0].parameters.silence
         behind = {name: lag for each in self._fusions for name, lag in each.behind.items() if lag > silence}
-        if not behind:
-            return ""
-        lags = ", ".join(f"{name} ({lag:.2f} s)" for name, lag in sorted(behind.items()))
-        return (
-            f"not used, as its frames arrive later than another sensor's by more than silence ({silence:g} s): {lags}; "
-            "check its clock and its network"
+        return "; ".join(
+            f"{name} is not used: its frames arrive {lag:.2f} s after another sensor's of the same time, more than "
+            f"silence ({silence:g} s); check its clock and its network"
+            for name, lag in sorted(behind.items())
         )
 
     @property

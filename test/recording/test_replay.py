@@ -285,7 +285,7 @@ def test_measurements_that_come_too_late_are_named(tmp_path: Path) -> None:
     report = replay(tmp_path / "late", tmp_path / "out", ReplaySettings(filter_name="ekf"))
     count = report.counters["filter too_late"]
     assert count > 40
-    expected = f"skeleton_filter: {count} measurements came more than 0.2 s (late_window) late and were not used"
+    expected = f"skeleton_filter: {count} measurements came more than 0.2 s late and were not used"
     assert report.warnings == (expected,)
 
 

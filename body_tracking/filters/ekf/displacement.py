@@ -72,7 +72,7 @@ class Displacement:
         """(53, 53) information of the orientations measured lately, whose errors are those before any is learnt."""
         space, sources = self._space, state.sources
         information = np.zeros_like(self._prior_information)
-        for number in np.flatnonzero(sources.speaking(state.stamp_ns)):
+        for number in np.flatnonzero(sources.active(state.stamp_ns)):
             misalignment, heading = sources.stated[number]
             error = sources.slow_variance[number] + np.diag([misalignment, misalignment, misalignment + heading])
             turning = lines.rotation_jacobian[sources.segments[number]]

@@ -8,15 +8,13 @@ import numpy as np
 
 from body_tracking.core.body_model import Posture
 from body_tracking.core.sides import headings_of, reversed_halves, swap_left_right
-from body_tracking.core.skeleton import MIRROR, N_JOINTS, NANOSECONDS, BoolArray, FloatArray, IntArray, Joint, Skeleton
+from body_tracking.core.skeleton import MIRROR, N_JOINTS, BoolArray, FloatArray, IntArray, Joint, Skeleton
 from body_tracking.filters.ekf.state import State, StateSpace
 
 _IMPROBABLE = 20.0
 """Squared normalised distance of the twists of both arms from the middle of their ranges (chi-square with 4 degrees of
 freedom) that one of 2000 poses exceeds: beyond it, the filter's facing of the person is probably wrong."""
 _TWISTS = ("shoulder_z", "forearm_pronation")
-_SPEAKING_NS = NANOSECONDS // 4
-"""A source without a measurement for longer is ignored."""
 _LIMBS = {"upper_arm": ("SHOULDER", "ELBOW"), "forearm": ("ELBOW", "WRIST")}
 _DIRECTION_STDDEV = 0.35
 """Radians: standard deviation of a limb's direction by a camera."""
@@ -60,8 +58,8 @@ class Facing:
             the state is doubted; else left and right of the upper body, the lower body or both are swapped, or removed
             where their heading is across the state's.
         """
-        speaking = state.stamp_ns - state.sources.stamps < _SPEAKING_NS
-        if not speaking.any():
+        active = state.sources.active(state.stamp_ns)
+        if not active.any():
             return state, skeleton
         posture = self._space.model.forward(state.q, state.lengths)
         expected = np.full((N_JOINTS, 3), np.nan)
@@ -69,7 +67,7 @@ class Facing:
         halves = reversed_halves(headings_of(skeleton.positions), headings_of(expected))
         if not halves:
             return state, skeleton
-        doubt = state.doubt + self._evidence(posture, state.sources.segments[speaking], skeleton)
+        doubt = state.doubt + self._evidence(posture, state.sources.segments[active], skeleton)
         state = state.but(doubt=max(doubt, 0.0))
         if doubt > _DOUBTED or self._is_improbable(state):
             return state, skeleton

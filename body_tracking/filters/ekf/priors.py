@@ -229,11 +229,11 @@ class Priors:
         Priors must not turn a segment whose orientation is measured: their error is the same every time, and would
         accumulate in the states of the sources.
         """
-        speaking = state.sources.speaking(state.stamp_ns)
-        if not speaking.any():
+        active = state.sources.active(state.stamp_ns)
+        if not active.any():
             return covariance, crosses
         t = self._space.tangent
-        turning = self._model.linearised(state.q, state.lengths).rotation_jacobian[state.sources.segments[speaking]]
+        turning = self._model.linearised(state.q, state.lengths).rotation_jacobian[state.sources.segments[active]]
         rows = turning.reshape(-1, self._space.nv)
         cross = rows @ covariance[t]
         s = cross[:, t] @ rows.T

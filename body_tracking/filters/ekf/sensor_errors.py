@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from body_tracking.core.measurement import offset_correlation
+from body_tracking.core.measurement import GIRDLE_CORRELATION, offset_correlation
 from body_tracking.core.orientation import SEGMENT_NUMBER
 from body_tracking.core.skeleton import NANOSECONDS, BoolArray, FloatArray, IntArray, Joint
 from body_tracking.filters.ekf.parameters import EkfParameters
@@ -79,9 +79,9 @@ class SensorErrors:
         self.carried = self._limb_table()
         joints = np.ix_(space.model.joints, space.model.joints)
         of_bones = min(_SLOW_BONE_CORRELATION, parameters.bone_correlation)
-        self._of_limbs: FloatArray = np.linalg.cholesky(offset_correlation(of_bones, 0.0)[joints]).astype(np.float64)
-        self._of_limbs_and_girdles: FloatArray = np.linalg.cholesky(offset_correlation(of_bones)[joints]).astype(
-            np.float64
+        self._of_limbs, self._of_limbs_and_girdles = (
+            np.linalg.cholesky(offset_correlation(of_bones, of_girdles)[joints]).astype(np.float64)
+            for of_girdles in (0.0, GIRDLE_CORRELATION)
         )
         self.slow_size = 3 * space.points + len(self._limbs)
 

@@ -51,7 +51,7 @@ _PARTS = np.array([0, 0, 0, 1])
 """Index of the stated variance (misalignment, heading) for each of misalignment (3) and heading."""
 _SAME = 0.02
 """Relative change of a stated variance below which it is ignored."""
-_SPEAKS_FOR_NS = NANOSECONDS // 4
+_ACTIVE_FOR_NS = NANOSECONDS // 4
 """A source without a measurement for longer does not constrain its segment."""
 _SMALL = 1e-4
 """Radians below which the first terms of a series are exact."""
@@ -142,9 +142,9 @@ class Sources:
     def __len__(self) -> int:
         return len(self.names)
 
-    def speaking(self, stamp_ns: int) -> BoolArray:
+    def active(self, stamp_ns: int) -> BoolArray:
         """(n,) whether a source has measured lately, so that it constrains its segment."""
-        return stamp_ns - self.stamps < _SPEAKS_FOR_NS
+        return stamp_ns - self.stamps < _ACTIVE_FOR_NS
 
     def find(self, name: str) -> int | None:
         """Index of the source of this name; None without one."""
