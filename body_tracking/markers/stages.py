@@ -175,7 +175,7 @@ class TriangulationStage(Stage):
         triangulation.prepare()
         self._sets: FrameSets[ImageBalls] = FrameSets(frames, round(tolerance * NANOSECONDS), round(wait * NANOSECONDS))
         self._frames = {setup.balls_topic(frame): frame for frame in frames}
-        self.inputs = tuple(Port(topic, Balls(), RELIABLE, perishable=True) for topic in self._frames)
+        self.inputs = tuple(Port(topic, Balls(), RELIABLE, perishable=True, foreign=True) for topic in self._frames)
         self.outputs = (Port(setup.POINTS, SpacePoints(), RELIABLE, measured=True),)
         if values["tf"]:
             self.outputs += (Port(graph.TF_STATIC, Frames(), LATCHED, optional=True),)

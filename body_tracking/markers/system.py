@@ -42,7 +42,8 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
                     "marker_cameras",
                     parameters={"setup": options["marker_setup"], "images": options["marker_images"]},
                 )
-            yield NodeSpec("marker_detector", "marker_detector", parameters=given)
+            if not any(topic.endswith("/balls") for topic in _played_topics(options)):
+                yield NodeSpec("marker_detector", "marker_detector", parameters=given)
             yield NodeSpec("marker_triangulation", "marker_triangulation", parameters=given)
         yield NodeSpec("rigid_body_tracker", "rigid_body_tracker", parameters=given)
         yield NodeSpec("marker_joint_angles", "marker_joint_angles", parameters=given)

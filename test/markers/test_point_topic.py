@@ -168,6 +168,9 @@ def test_the_option_replaces_the_cameras() -> None:
     assert specs["marker_points"].parameters["message"] == "MarkerArray"
     assert systems.played(options, ["/mocap/points"]) == ("/mocap/points",)
     assert "marker_detector" in {spec.name for spec in systems.all_nodes_for(options)}
+    for name, detects in (("image_raw", True), ("balls", False)):
+        recorded = systems.options_of(**given, bag="bag", played=(f"/left/{name}", f"/right/{name}"))
+        assert ("marker_detector" in {spec.name for spec in systems.nodes_for(recorded)}) == detects
     for wrong in ({**given, "marker_points": "a:Odometry"}, {"marker_points": "a"}):
         with pytest.raises(graph.GraphError, match="marker points: "):
             systems.nodes_for(systems.options_of(**wrong))
