@@ -93,6 +93,19 @@ def test_a_reliable_graph_names_every_lost_message_and_another_one_names_the_opt
     assert monitor.summary(robot, 3.0, {}).endswith("mesh 50; see docs/troubleshooting.md")
 
 
+def test_many_measurements_that_came_too_late_for_ekf_are_named_at_the_end() -> None:
+    """With ``--reliable`` no message is lost on a busy machine, but its inertial sensors were silently left out."""
+    found = {"skeleton_filter": NodeStatus("", 0, "", {"received": "2489", "too_late": "2161"})}
+    monitor = object.__new__(GraphMonitor)  # without a node
+    monitor._statuses, monitor.angles = found, 220
+    options = {"bag": "arm", "record": None, "reliable": True}
+    late = "angles; 2161 measurements came too late for skeleton_filter"
+    assert monitor.summary(options, 3.0, {}).endswith(f"{late}; --rate 0.5 plays more slowly")
+    assert monitor.summary(options | {"bag": ""}, 3.0, {}).endswith(f"{late}; see docs/troubleshooting.md")
+    found["skeleton_filter"].values["too_late"] = "40"
+    assert monitor.summary(options, 3.0, {}).endswith(" angles")
+
+
 def monitor_without_node() -> GraphMonitor:
     monitor = object.__new__(GraphMonitor)
     monitor._angles_topics, monitor._namespace, monitor.angles, monitor.clock_ns = (), "/", 0, 0
@@ -192,6 +205,16 @@ def test_the_recorder_rightly_waits_for_a_bag_that_has_not_begun() -> None:
     monitor._statuses["bag_player"] = NodeStatus("", 0, "playing", {"position s": "0.4"}, received=time.monotonic())
     monitor._statuses["bag_recorder"] = NodeStatus("", 1, waiting, received=time.monotonic())
     assert "bag_recorder" not in monitor.line(with_bag, 1.0, {})
+
+
+def test_sensors_rightly_send_nothing_before_the_bag_plays() -> None:
+    monitor = monitor_without_node()
+    silent = "forearm_left: nothing has come yet"
+    monitor._statuses = {"imu_skeleton": NodeStatus("imu_skeleton: state", 1, silent, received=time.monotonic())}
+    options = options_of(sensors=("kinect1",), bag="bag", imus=("forearm_left",))
+    assert silent not in monitor.line(options, 5.0, {})
+    monitor.clock_ns = 1
+    assert f"imu_skeleton: {silent}" in monitor.line(options, 8.0, {})
 
 
 def test_joint_angles_rightly_wait_for_a_filter_that_starts() -> None:

@@ -40,6 +40,8 @@ _SHOWING = ("viewer", "body_markers")
 """Nodes that show the latest messages, and leave out others on purpose."""
 _NOTABLE_LOSS, _FEW = 0.01, 10
 """Share of a node's received messages, and a number that is lost where a node has just started."""
+_NOTABLE_LATE = 0.02
+"""Share of the filter's received messages that came too late to be used."""
 _REPORTED_S = 1.5
 """Seconds of a bag after which each node has reported what it gets of it."""
 _FRESH = 3.0
@@ -236,9 +238,9 @@ class GraphMonitor:
             if not options["bag"] and elapsed > _SILENT_S:
                 parts += self._silent_sensors(options, fresh)
         if not self.angles:
-            early = starts or elapsed < _SILENT_S
-            # the recorder waits for the bag's clock, and the filter may not have started
-            parts += problem_parts(fresh, ("bag_recorder",) * starts + ("joint_angles",) * early)
+            # all wait for the bag, and joint_angles for a filter that may not have started
+            waiting = (*fresh,) if starts else ("joint_angles",) * (elapsed < _SILENT_S)
+            parts += problem_parts(fresh, waiting)
         malformed, _ = _malformed(fresh)
         if malformed:
             parts.append(f"malformed {malformed}")
@@ -250,6 +252,15 @@ class GraphMonitor:
         if restarts:
             parts.append("restarts " + ", ".join(f"{name} {count}" for name, count in restarts.items()))
         return " | ".join(parts)
+
+    def _too_late(self, bag: bool) -> str:
+        """That ``ekf`` left out many measurements, and what helps; empty where it used nearly all."""
+        status = self._statuses.get("skeleton_filter", NodeStatus("", 0, ""))
+        late, received = (status.number(key) or 0.0 for key in ("too_late", "received"))
+        if late <= _NOTABLE_LATE * received:
+            return ""
+        advice = "--rate 0.5 plays more slowly" if bag else "see docs/troubleshooting.md"
+        return f"; {late:.0f} measurements came too late for skeleton_filter; {advice}"
 
     def _earlier(self, now: float) -> Mapping[str, NodeStatus]:
         """What the nodes reported :data:`_RECENT_S` before, or first."""
@@ -335,6 +346,7 @@ class GraphMonitor:
         if losses and not reliable:
             later = options["bag"] and not options.get("robot")  # which does not follow late angles
             text += "; --reliable processes them, later" if later else "; see docs/troubleshooting.md"
+        text += self._too_late(bool(options["bag"]))
         if restarts:
             text += "; restarts: " + ", ".join(f"{name} {count}" for name, count in restarts.items())
         return text
