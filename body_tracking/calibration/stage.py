@@ -14,6 +14,7 @@ from body_tracking.calibration.storage import load, save
 from body_tracking.core.names import TF_STATIC
 from body_tracking.core.parameters import Parameter, Value, fields_of, parameters_from
 from body_tracking.core.qos import LATCHED, Qos
+from body_tracking.core.repeats import Repeats
 from body_tracking.core.sensor_poses import CalibrationResult
 from body_tracking.core.skeleton import NANOSECONDS, Joint, Skeleton
 from body_tracking.messages.codecs import Clock, Pose, Poses, SensorClock
@@ -90,6 +91,7 @@ class CalibrationStage(Stage):
         """Frames in a row with stamps as in a recording, and seconds from the last one to the wall clock."""
         self._unsaved = self._saved = False
         self._subjects = {sensor: SubjectSelector() for sensor in sensors}
+        self._repeats = {sensor: Repeats() for sensor in sensors}
         self._odd: dict[str, tuple[int, float]] = {}
         """Frames in a row with an impossible trunk, and its last length, metres."""
         self._sensors = {graph.skeleton_topic(sensor): sensor for sensor in sensors}
@@ -121,7 +123,7 @@ class CalibrationStage(Stage):
             self._check_size(sensor, skeleton)
             self._check_time(skeleton)
         subject = self._subjects[sensor].pick(payload)
-        if subject is None:
+        if subject is None or self._repeats[sensor].add(subject.stamp_ns, subject.positions):
             return ()
         updates = self.calibration.push(sensor, subject, now.ros_ns)
         self._unsaved |= bool(updates)

@@ -21,6 +21,7 @@ from body_tracking.camera.topics import COMPRESSION, DRIVERS, CameraTopics, imag
 from body_tracking.core.camera import Camera, CameraError
 from body_tracking.core.parameters import Parameter, Value
 from body_tracking.core.qos import LATCHED
+from body_tracking.core.repeats import REPEATED, Repeats
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import NANOSECONDS, SingleArray, Skeleton
 from body_tracking.core.sources import check_sensor_name, optical_frame
@@ -100,6 +101,7 @@ class CameraStage(Stage):
         self._infos: dict[str, Camera] = {}
         self._registration: Registration | None = None
         tolerance_ns = round(float(str(values["tolerance"])) * NANOSECONDS)
+        self._repeats = {_COLOUR: Repeats(), _DEPTH: Repeats()}
         self._sets: FrameSets[Any] = FrameSets((_COLOUR, _DEPTH), tolerance_ns, WAIT_NS)
         compressed = str(values["compressed"])
         colour, depth = images_of(topics, compressed)
@@ -196,6 +198,12 @@ class CameraStage(Stage):
         self._check(colour, depth)
         self._counters["pairs of images"] += 1
         self._problem = COVERED if is_covered(depth) else ""
+        images = ((_COLOUR, colour), (_DEPTH, depth))
+        repeated = [what for what, image in images if self._repeats[what].add(stamp_ns, image)]
+        if repeated and not self._problem:
+            self._counters[f"repeated images of {self._name}"] += 1
+            self._problem = REPEATED.format(f"{' and '.join(repeated)} image")
+            return ()
         seen = self._registration(depth)
         source, camera = self._infos[_COLOUR], self._registration.camera
         found = []

@@ -366,7 +366,9 @@ class FilterStage(Stage):
         before, self._t_poses = self._t_poses, counters.get("t_poses", 0)
         if self._t_poses > before:
             self.events.append("joint centres of this person estimated from a T-pose: angles are more accurate now")
-        return 0, str(self.values["filter"]), {"tracked": ", ".join(self._tracked_ids()), **counters}
+        name, frozen = str(self.values["filter"]), "" if self._people is None else self._people.frozen
+        text = f"{name} ({frozen})" if frozen else name
+        return int(bool(frozen)), text, {"tracked": ", ".join(self._tracked_ids()), **counters}
 
     @property
     def counters(self) -> Mapping[str, int]:

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from body_tracking.core.clocks import jumped_back
+from body_tracking.core.repeats import REPEATED, Repeats
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Skeleton
 from body_tracking.fusion.association import Association
@@ -63,6 +64,7 @@ class _Sensor(Placement):
     def clear(self) -> None:
         super().clear()
         self.selector = SubjectSelector()
+        self.repeats = Repeats()
         self.last_ns: int | None = None  # in its own clock
         self.used: SensorPose | None = None
         self.pending: deque[tuple[int, SensorPose, Skeleton]] = deque(maxlen=_PENDING)
@@ -112,6 +114,12 @@ class People(PlacedSensors[_Sensor]):
         return () if self._chosen is None else (1,)
 
     @property
+    def frozen(self) -> str:
+        """Which sensors repeat one frame, in words; empty if none does."""
+        names = ", ".join(name for name, source in self._sensors.items() if source.repeats.frozen)
+        return names and f"{names}: {REPEATED.format('frame')}"
+
+    @property
     def nearest(self) -> int | None:
         """With all, the number of the person whom ``nearest`` would choose."""
         return None if self._chosen is None else self._slots.of.get(self._chosen)
@@ -144,6 +152,9 @@ class People(PlacedSensors[_Sensor]):
         if not seen:
             return []
         source = self._sensors[sensor]
+        if source.repeats.add(seen[0].stamp_ns, *(skeleton.positions for skeleton in seen)):
+            self.counters[f"repeated frames of {sensor}"] += 1
+            return []
         one = self.parameters.subject != ALL
         placed = self._placed(sensor, source, seen[0].stamp_ns)
         if placed is None:

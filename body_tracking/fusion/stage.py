@@ -141,11 +141,12 @@ class FusionStage(Stage):
             )
         silence = self._fusions[0].parameters.silence
         behind = {name: lag for each in self._fusions for name, lag in each.behind.items() if lag > silence}
-        return "; ".join(
+        late = [
             f"{name} is not used: its frames arrive {lag:.2f} s after another sensor's of the same time, more than "
             f"silence ({silence:g} s); check its clock and its network"
             for name, lag in sorted(behind.items())
-        )
+        ]
+        return "; ".join(filter(None, (self._people.frozen, *late)))
 
     @property
     def counters(self) -> Mapping[str, int]:

@@ -257,6 +257,8 @@ class InertialTracker:
         sensor = self._sensors[segment]
         reading = sensor.take(sample, received_ns)
         self._clocks.take_reading(sample.stamp_ns, received_ns)
+        if sensor.frozen:
+            self.counters[f"repeated readings of {segment}"] += 1
         if reading is None or sensor.problems:
             return _NO_OUTPUT
         stamp_ns = reading.stamp_ns + self._offset_ns(sensor)

@@ -16,6 +16,7 @@ from body_tracking.core import so3
 from body_tracking.core.clocks import ReceiptClock
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.imu import ImuSample, ImuWatch
+from body_tracking.core.repeats import Repeats
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.inertial.imu_orientation import OUTAGE_S, OrientationEstimator
 
@@ -27,9 +28,6 @@ UNKNOWN_HEADING: Final = np.pi**2 / 3.0
 """rad2: variance of a heading that is uniform over a turn."""
 _OTHER_FRAME = 50
 """Readings of another frame in a row after which that frame is accepted."""
-_FROZEN_NS = round(0.3 * NANOSECONDS)
-"""A reading that is repeated for longer is no longer used, as of a radio that lost its sensor: after 3 s of it all
-angles of three simulated people erred by 23 to 33 degrees, now by 7 to 24."""
 _SPACING_NS = NANOSECONDS // 55
 """Least time between readings in the history: 50 per second are enough."""
 _STATED: Final = np.diag([0.03, 0.03, 0.1]) ** 2
@@ -116,9 +114,13 @@ class WornSensor:
         self._turned = 0.0
         self.has_field = False
         self._field_known = False
-        self._values: FloatArray = np.empty(0)
-        self._changed_ns = 0
+        self._repeats = Repeats()
         self.clock.reset()
+
+    @property
+    def frozen(self) -> bool:
+        """Whether its driver repeats one reading, which is not used."""
+        return self._repeats.frozen
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -149,7 +151,6 @@ class WornSensor:
         self._check_frame(sample.frame_id)
         self.counters["readings"] += 1
         if self._is_frozen(sample, received_ns):
-            self.counters["frozen"] += 1
             return None
         if sample.orientation is None and self._oriented_ns is not None:
             if sample.stamp_ns - self._oriented_ns < OUTAGE_S * NANOSECONDS:
@@ -230,11 +231,7 @@ class WornSensor:
         if rate is None or force is None:
             return False
         given = (rate, force) if sample.orientation is None else (rate, force, sample.orientation)
-        values = np.concatenate(given)
-        if np.array_equal(values, self._values):
-            return received_ns - self._changed_ns > _FROZEN_NS
-        self._values, self._changed_ns = values, received_ns
-        return False
+        return self._repeats.add(received_ns, *given)
 
     def _receive(self, sample: ImuSample, received_ns: int) -> None:
         """Update the clock, and count outages."""

@@ -12,6 +12,7 @@ import numpy as np
 from body_tracking.core.camera import Camera
 from body_tracking.core.parameters import Parameter, Value, fields_of, parameters_from
 from body_tracking.core.qos import LATCHED, RELIABLE
+from body_tracking.core.repeats import REPEATED, Repeats
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.core.sources import check_sensor_name, optical_frame
@@ -22,7 +23,7 @@ from body_tracking.mesh.body_index import IndexArray, IndexPairs
 from body_tracking.mesh.body_model import Body
 from body_tracking.mesh.codecs import BodyIndex, DepthImage, MeshMarker
 from body_tracking.mesh.depth import DepthCamera, DepthError
-from body_tracking.mesh.person import COVERED
+from body_tracking.mesh.person import COVERED, is_covered
 from body_tracking.mesh.personalisation import DistinctPoses, PersonalisationError, personalise
 from body_tracking.mesh.sensor_orientations import SensorOrientations
 from body_tracking.mesh.topics import (
@@ -242,6 +243,7 @@ class DepthSensor:
         self._tracker: MeshTracker | None = None
         self._counters: Counter[str] = Counter()
         self.pairs = IndexPairs(body_index_topic(camera), self._counters)
+        self._repeats = Repeats()
 
     @property
     def counters(self) -> Counter[str]:
@@ -280,6 +282,10 @@ class DepthSensor:
         if self._tracker is None:
             self._counters[_NO_INFO] += 1
             self.problem = f"no calibration: nothing on {info_topic(self._camera)}"
+            return None
+        if self._repeats.add(stamp_ns, depth) and not is_covered(depth):
+            self._counters[f"repeated images of {self._camera}"] += 1
+            self.problem = REPEATED.format("image")
             return None
         gone = self._counters["people lost"]
         names = self._model.joint_names

@@ -293,7 +293,7 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
         counters |= Counter(written.counters)  # both halves may have counted the same message
         states = {node: stage.state(bag.end_ns) for node, stage in first.items()}
         problems = [f"{node}: {text}" for node, (level, text, _) in states.items() if level and text]
-        problems += _too_late(counters)
+        problems += _left_out(counters)
         if not written.frames:
             given = ", ".join(settings.sensors or sources)
             said = "; ".join(problems) or _listed(+counters)
@@ -325,12 +325,14 @@ def _without(settings: ReplaySettings, bag: BagReader) -> bool:
     return bool(settings.options()["computed"]) or not graph.sensors_among(bag.topics)
 
 
-def _too_late(counters: Mapping[str, int]) -> list[str]:
-    """A warning where ``ekf`` left out many measurements because they were recorded too late."""
+def _left_out(counters: Mapping[str, int]) -> list[str]:
+    """Warnings of measurements that a driver repeated, or that were recorded too late for ``ekf``, if many."""
+    repeated = {name.partition("repeated ")[2]: count for name, count in counters.items() if "repeated " in name}
+    found = [f"{count} {name}: the same again and again, not used" for name, count in sorted(repeated.items())]
     late = counters.get("filter too_late", 0)
     if late <= _MANY * sum(counters.get(f"filter {name}", 0) for name in ("frames", "orientations")):
-        return []
-    return [f"skeleton_filter: {late} measurements came more than 0.2 s late and were not used"]
+        return found
+    return [*found, f"skeleton_filter: {late} measurements came more than 0.2 s late and were not used"]
 
 
 def _filters_in(diagnostics: bytes) -> list[str]:
@@ -339,7 +341,8 @@ def _filters_in(diagnostics: bytes) -> list[str]:
         found = statuses(deserialize(DIAGNOSTICS, diagnostics))
     except BodyTrackingError:
         return []
-    return [each.text for each in found if each.node.rpartition("/")[2] == "skeleton_filter" and each.text in ROLES]
+    texts = (each.text for each in found if each.node.rpartition("/")[2] == "skeleton_filter")
+    return [name for text in texts if (name := text.partition(" ")[0]) in ROLES]
 
 
 def _listed(counters: Mapping[str, int]) -> str:

@@ -306,7 +306,8 @@ class GraphMonitor:
     def _delay(options: Options, fresh: Mapping[str, NodeStatus]) -> str:
         """From a sensor's message to the angles: the sum of the nodes' delays, each with the transport to it."""
         running = fresh.get("skeleton_filter")
-        role = ROLES.get(running.text if running is not None else "")  # the filter may have changed since the start
+        # the filter may have changed since the start
+        role = ROLES.get(running.text.partition(" ")[0] if running is not None else "")
         option = options["filter_input"]
         source = (role or role_of(options)).input if option in ("", graph.AUTO) else option
         chain = _CHAIN if source == graph.SENSORS_INPUT else ("fusion", *_CHAIN)

@@ -83,7 +83,7 @@ def test_nobody_is_found_in_an_empty_room_and_a_lost_person_is_searched_for_agai
     stamps = list(recorded.colour)
     first = stamps[0]
     empty = np.full_like(recorded.colour[first], 170)
-    assert show(node, first - 1_000_000_000, empty, recorded.depth[first]) == []
+    assert show(node, first - 1_000_000_000, empty, recorded.depth[stamps[1]]) == []
     assert len(show(node, first, recorded.colour[first], recorded.depth[first])) == 1
     assert show(node, stamps[1], empty, recorded.depth[first]) == []
     assert node.counters["people lost"] == 1
@@ -102,6 +102,24 @@ def test_images_within_the_tolerance_are_one_pair_and_others_are_counted() -> No
     assert show(node, stamps[3], colour, depth, stamps[3] + 30_000_000) == []
     assert list(node.poll(stamps[3] + 1_000_000_000)) == []
     assert node.counters["images without the other one"] == 2
+
+
+@networks
+@pytest.mark.parametrize("frozen", ["colour", "depth"])
+def test_images_that_repeat_are_not_used_and_named(frozen: str) -> None:
+    node, recorded = calibrated(), recording()
+    stamps, repeated = list(recorded.colour), []
+    for stamp_ns in stamps[:8]:
+        colour, depth = (
+            getattr(recorded, kind)[stamps[0] if kind == frozen else stamp_ns] for kind in ("colour", "depth")
+        )
+        repeated.append(not show(node, stamp_ns, colour, depth))
+    assert repeated == [stamp_ns - stamps[0] > 300_000_000 for stamp_ns in stamps[:8]]
+    level, text, _ = node.state(0)
+    assert level == 1 and text.startswith(f"the same {frozen} image again and again is not used")
+    assert node.counters["repeated images of camera1"] == sum(repeated)
+    assert show(node, stamps[8], recorded.colour[stamps[8]], recorded.depth[stamps[8]])
+    assert node.state(0)[:2] == (0, "")
 
 
 @networks
@@ -183,7 +201,7 @@ def test_images_of_another_size_are_named_and_a_covered_lens() -> None:
     assert node.counters["colour images of another size"] == 1
     assert show(node, stamps[1], colour, np.zeros_like(depth)) == []
     assert "covered" in node.state(0)[1]
-    assert len(show(node, stamps[9], colour, depth)) == 1
+    assert len(show(node, stamps[9], recorded.colour[stamps[9]], recorded.depth[stamps[9]])) == 1
     assert node.state(0)[:2] == (0, "")
 
 

@@ -22,8 +22,9 @@ TIMES: Final = np.arange(0.0, 6.0, FRAME)
 
 
 def given(stage: Stage, positions: FloatArray) -> tuple[int, str]:
-    """Level and text of a stage after one sensor's positions at ``TIMES``."""
-    for time, points in zip(TIMES, positions, strict=True):
+    """Level and text of a stage after one sensor's positions at ``TIMES``, with noise of a millimetre."""
+    noise = 0.001 * np.random.default_rng(0).normal(size=positions.shape)
+    for time, points in zip(TIMES, positions + noise, strict=True):
         stamp_ns = NANOSECONDS + round(time * NANOSECONDS)
         skeleton = Skeleton(stamp_ns, "kinect1_optical_frame", points, np.full(25, 2, np.uint8))
         list(stage.take(graph.skeleton_topic("kinect1"), (skeleton,), Now(stamp_ns, stamp_ns)))

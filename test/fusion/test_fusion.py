@@ -230,7 +230,7 @@ def test_a_sensor_whose_frames_arrive_too_late_is_named(late: str, lag: float) -
     for pose in POSES.values():
         list(stage.take(graph.CALIBRATION, pose, Now(0, 0)))
     list(stage.take(graph.CALIBRATION_CLOCK, ("kinect2", 0, ClockModel(OFFSET_NS)), Now(0, 0)))
-    arriving = [(at + round(lag * NANOSECONDS) * (name == late), name, seen) for name, seen, at in frames(3.0)]
+    arriving = [(at + round(lag * NANOSECONDS) * (name == late), name, seen) for name, seen, at in frames(3.0, 0.001)]
     for at, name, seen in sorted(arriving, key=lambda each: each[0])[:150]:  # both still come
         list(stage.take(graph.skeleton_topic(name), (seen,), Now(at, at)))
         list(stage.poll(at))
@@ -238,6 +238,29 @@ def test_a_sensor_whose_frames_arrive_too_late_is_named(late: str, lag: float) -
     assert level == (lag > 0.1)
     assert text.startswith(f"{late} is not used: its frames arrive 0." if lag > 0.1 else "")
     assert bool(text) == (lag > 0.1)
+
+
+@pytest.mark.parametrize("frozen", ["kinect1", "kinect2"])
+def test_a_sensor_that_repeats_one_frame_is_named_and_left_out(frozen: str) -> None:
+    stage = FusionStage(check_all(FusionStage.PARAMETERS, {"sensors": ("kinect1", "kinect2")}))
+    for pose in POSES.values():
+        list(stage.take(graph.CALIBRATION, pose, Now(0, 0)))
+    list(stage.take(graph.CALIBRATION_CLOCK, ("kinect2", 0, ClockModel(OFFSET_NS)), Now(0, 0)))
+    first: dict[str, Skeleton] = {}
+    fused: list[Skeleton] = []
+    for name, seen, at in frames(4.0, 0.001):
+        first.setdefault(name, seen)
+        if name == frozen and 2 * NANOSECONDS < at < 3 * NANOSECONDS:
+            seen = replace(seen, positions=first[name].positions)
+        for output in (*stage.take(graph.skeleton_topic(name), (seen,), Now(at, at)), *stage.poll(at)):
+            fused += output.payload
+        text = f"{frozen}: the same frame again and again is not used: restart the sensor's driver"
+        if not (2.0 < at / NANOSECONDS < 2.4 or 2.95 < at / NANOSECONDS < 3.1):  # while it begins and ends
+            assert (stage.state(0)[1] == text) == (2 < at / NANOSECONDS < 3)
+    assert stage.counters[f"association repeated frames of {frozen}"] in (19, 20, 21)
+    stamps = np.array([each.stamp for each in fused])
+    assert np.diff(stamps).max() < 0.1
+    assert errors(fused)[(stamps > 1.0) & (stamps < 1.95) | (stamps > 2.5)].max() < 0.05
 
 
 def test_output_continues_while_the_reference_is_silent() -> None:

@@ -34,11 +34,12 @@ POSES = {
 
 
 def seen(sensor: str, time: float, places: dict[int, tuple[float, float]]) -> list[Skeleton]:
-    """A sensor's skeletons of people who stand at (x, y) in world, by its body numbers."""
+    """A sensor's skeletons of people who stand at (x, y) in world, by its body numbers, with noise of a micrometre."""
     pose = POSES[sensor]
+    noise = 1e-6 * np.random.default_rng(round(1000 * time)).normal(size=FIGURE.shape)
     result = []
     for number, place in sorted(places.items()):
-        positions = (FIGURE + [*place, 0.0] - pose.translation) @ pose.rotation
+        positions = (FIGURE + noise + [*place, 0.0] - pose.translation) @ pose.rotation
         stamp = time + (OFF if sensor == "kinect2" else 0.0)
         result.append(replace(frame(stamp, positions, sensor), body=number))
     return result

@@ -101,6 +101,17 @@ def test_other_encodings_are_refused_and_counted() -> None:
     assert node.counters["messages that cannot be used"] == 1
 
 
+def test_images_that_repeat_are_not_used_and_named() -> None:
+    node = calibrated()
+    first = recording().images[STAMPS[0]]
+    tracked = [bool(take(node, number, first)) for number in range(15)]
+    late = [stamp_ns - STAMPS[0] > 0.3 * NANOSECONDS for stamp_ns in STAMPS[:15]]
+    assert 0 < sum(late) < 10 and tracked == [not each for each in late]
+    assert node.state(0)[:2] == (1, "the same image again and again is not used: restart the sensor's driver")
+    assert node.counters["repeated images of kinect1"] == sum(late)
+    assert take(node, 15) and node.state(0)[:2] == (0, "")
+
+
 @pytest.mark.parametrize("covering", [0.0, np.nan])
 def test_a_covered_lens_and_a_hand_before_it_are_survived(covering: float) -> None:
     node = calibrated()

@@ -25,7 +25,8 @@ from body_tracking.calibration import online
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.message_types import DIAGNOSTICS, JOINT_STATE, POINT_CLOUD, TIME_REFERENCE, TRANSFORM
 from body_tracking.core.parameters import ParameterError
-from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, TrackingState
+from body_tracking.core.repeats import FROZEN_NS
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.filters.smoothing import MAX_LAG
 from body_tracking.kinect.simulated import KinectErrors
@@ -35,6 +36,7 @@ from body_tracking.kinematics.ranges import Ranges
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.base import to_nanoseconds
 from body_tracking.messages.calibration import time_reference_to_clock, transform_to_pose
+from body_tracking.messages.codecs import Skeletons
 from body_tracking.messages.diagnostics import diagnostics
 from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.pipeline import graph
@@ -44,7 +46,15 @@ from body_tracking.recording.forked import Downstream, ForkedDownstream
 from body_tracking.recording.importer import import_files
 from body_tracking.recording.replay import ReplayError, ReplaySettings, replay
 from body_tracking.recording.rig import RigReader
-from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagError, BagReader, BagWriter, RawMessage, deserialize
+from body_tracking.recording.rosbag2 import (
+    BAG_MESSAGES,
+    BAG_WIRE,
+    BagError,
+    BagReader,
+    BagWriter,
+    RawMessage,
+    deserialize,
+)
 from body_tracking.recording.summary import summary
 from body_tracking.simulation.bags import write_bag
 from body_tracking.simulation.scene import Setup, simulate
@@ -287,6 +297,28 @@ def test_measurements_that_come_too_late_are_named(tmp_path: Path) -> None:
     assert count > 40
     expected = f"skeleton_filter: {count} measurements came more than 0.2 s late and were not used"
     assert report.warnings == (expected,)
+
+
+@pytest.mark.parametrize("filter_name", ["lkf_constant_velocity", "ekf"])
+def test_a_sensor_that_repeats_one_frame_is_named(filter_name: str, tmp_path: Path) -> None:
+    topic = "/kinect2/skeleton"
+    with BagReader(BAG) as bag, BagWriter(tmp_path / "frozen") as writer:
+        known = {each: bag.topics[each].type_name for each in bag.topics if each.startswith("/kinect")}
+        for each, kind in known.items():
+            writer.add_topic(each, kind)
+        from_ns, to_ns = bag.start_ns + 4 * NANOSECONDS, bag.start_ns + 6 * NANOSECONDS
+        codec, left_out = Skeletons(), 0
+        last: tuple[Skeleton, ...] = ()
+        for raw in bag.messages(list(known)):
+            cdr = raw.cdr
+            if raw.topic == topic:
+                (seen,) = codec.decode(cdr, BAG_WIRE)
+                last = last if last and from_ns < raw.log_time_ns < to_ns else (seen,)
+                left_out += seen.stamp_ns - last[0].stamp_ns > FROZEN_NS
+                cdr = codec.encode((replace(seen, positions=last[0].positions),), BAG_WIRE)
+            writer.write(raw.topic, cdr, raw.log_time_ns)
+    report = replay(tmp_path / "frozen", tmp_path / "out", ReplaySettings(filter_name=filter_name))
+    assert report.warnings == (f"{left_out} frames of kinect2: the same again and again, not used",)
 
 
 def elbows(bag_path: Path) -> tuple[FloatArray, FloatArray]:
