@@ -143,7 +143,7 @@ $(SITE_VENV)/.installed: docs/requirements.txt | $(STAMP)
 
 site: $(SITE_VENV)/.installed ## these pages as a site in build/site
 	@NO_MKDOCS_2_WARNING=1 $(SITE_VENV)/bin/mkdocs build --quiet --strict
-	@echo "site: build/site/index.html"
+	@echo "site: build/site/index.html (its search needs a server: python3 -m http.server -d build/site)"
 
 clean: ## remove everything that make and colcon made
 	rm -rf $(VENV) $(SITE_VENV) $(DEMO) $(DEMO_MARKERS) $(DEMO_MESH) $(DEMO_CAMERA) $(DEMO_IMUS) .ros2_workspace build install log dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -62,6 +62,8 @@ SERVICES: Final = tuple(service for system in SYSTEMS for service in system.serv
 COMMANDS: Final = {command.name: command for system in SYSTEMS for command in system.commands}
 LAYERS: Final = tuple(layer for system in SYSTEMS for layer in system.layers)
 VIEWS: Final = tuple(view for system in SYSTEMS for view in system.views)
+_WIDTH: Final = 60
+"""Characters of an option's choices that stand in the usage; more stand in its text."""
 _PLACED: Final = sorted(NODES.values(), key=lambda node: node.place)
 STAGES: Final = tuple(node.name for node in _PLACED if node.stage)
 """The nodes that host a stage, in the order in which messages go through them."""
@@ -137,6 +139,8 @@ def add_options(parser: argparse.ArgumentParser, *names: str, **texts: str) -> N
             kind = Path if option.path else type(option.default)
             choices = None if option.choices is None else tuple(option.choices())
             metavar = option.metavar or None
+            if choices and len(joined := ", ".join(choices)) > _WIDTH:
+                metavar, text = option.name.upper(), f"{text}; one of {joined}"
             default = option.default if isinstance(option.default, int | float) else None
             group.add_argument(flag, type=kind, choices=choices, metavar=metavar, default=default, help=text)
 

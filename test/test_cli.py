@@ -32,6 +32,21 @@ def test_every_command_has_a_help_and_is_listed(command: str, capsys: pytest.Cap
     assert command or all(each.split()[0] in text for each in COMMANDS)
 
 
+def _parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    below = [each for each in parser._actions if isinstance(each, argparse._SubParsersAction)]
+    yield from (found for each in below for verb in each.choices.values() for found in _parsers(verb))
+    if not below:
+        yield parser
+
+
+def test_each_help_says_what_its_command_does_in_lines_that_a_terminal_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+    for name in cli.subcommands():
+        for found in _parsers(cli.parser(name)):
+            assert found.description, found.prog
+            assert max(map(len, found.format_help().splitlines())) <= 100, found.prog
+
+
 @pytest.fixture
 def nobody(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
     """An empty folder, and a ROS domain without anybody."""

@@ -71,8 +71,8 @@ SYSTEM = System(
         Option(
             "filter",
             "",
-            "the filter (default: lkf_constant_velocity, or ekf where all sensors are colour cameras); overrides the "
-            "parameters file",
+            "the filter (default: lkf_constant_velocity, or ekf where all sensors are colour cameras or inertial "
+            "ones); overrides the parameters file",
             choices=_filters,
             parameter=("skeleton_filter", "filter"),
             offline=True,

@@ -41,12 +41,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """``body_tracking camera``."""
     command = subparsers.add_parser("camera", description=__doc__)
     actions = command.add_subparsers(metavar="ACTION", required=True)
-    model = actions.add_parser(
-        "model", help="fetch the networks, if they are not there (MediaPipe's, Apache licence 2.0; 35 MB by pip)"
-    )
+    text = "fetch the networks, if they are not there (MediaPipe's, Apache licence 2.0; 35 MB by pip)"
+    model = actions.add_parser("model", help=text, description=text)
     model.add_argument("folder", type=Path, nargs="?", help="where to (default: the user's cache)")
     model.set_defaults(run=_model)
-    show = actions.add_parser("show", help="draw the people in an image")
+    text = "draw the people in an image"
+    show = actions.add_parser("show", help=text, description=text)
     show.add_argument("image", type=Path, help="PNG or JPEG file")
     show.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="picture to write")
     show.add_argument("--people", type=int, default=6, metavar="N", help="the largest number of people (6)")

@@ -133,11 +133,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     if isinstance(parser, Parser):
         parser.about_bag = "'bag info BAG' lists what a recording holds"
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
-    info = verbs.add_parser("info", help="list the contents of a bag, and what is missing")
+    text = "list the contents of a bag, and what is missing"
+    info = verbs.add_parser("info", help=text, description=text)
     info.add_argument("bag", type=Path, metavar="BAG", help="a folder, or a single mcap file")
     info.add_argument("--json", action="store_true", help="print the result as JSON")
     info.set_defaults(run=run)
-    closing = verbs.add_parser("recover", help="close a bag whose recorder died, so that ros2 bag opens it too")
+    text = "close a bag whose recorder died, so that ros2 bag opens it too"
+    closing = verbs.add_parser("recover", help=text, description=text)
     closing.add_argument("bag", type=Path, metavar="BAG", help="the folder")
     closing.add_argument("--json", action="store_true", help="print its contents afterwards as JSON")
     closing.set_defaults(run=run)

@@ -136,12 +136,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """``body_tracking mesh``."""
     command = subparsers.add_parser("mesh", description=__doc__)
     actions = command.add_subparsers(metavar="ACTION", required=True)
-    shape = actions.add_parser("personalise", help="write the shape of a recorded person, for up --person")
+    text = "write the shape of a recorded person, for up --person"
+    shape = actions.add_parser("personalise", help=text, description=text)
     shape.add_argument("bag", type=Path, help="recording with depth images")
     shape.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="YAML file to write")
     shape.add_argument("--overwrite", action="store_true", help="replace an existing FILE")
     shape.set_defaults(run=_personalise)
-    show = actions.add_parser("show", help="draw the mesh over depth images")
+    text = "draw the mesh over depth images"
+    show = actions.add_parser("show", help=text, description=text)
     show.add_argument("bag", type=Path, help="recording with depth images and the mesh")
     show.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="picture to write")
     show.add_argument("--images", type=int, default=4, metavar="N", help="evenly spaced over the recording (4)")

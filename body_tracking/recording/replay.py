@@ -410,7 +410,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     add_options(
         command,
         *_OFFLINE_OPTIONS,
-        filter=f"default: {DEFAULT_FILTER}, or ekf where all sensors are colour cameras",
+        filter=f"default: {DEFAULT_FILTER}, or ekf where all sensors are colour cameras or inertial ones",
         convention="convention of the joint angles (default: that of the filter)",
         sensors="the sensors, the reference first; none: no skeletons, markers or depth alone (default: all in the "
         "bag)",

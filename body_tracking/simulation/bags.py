@@ -213,11 +213,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         metavar="FOLDER",
         help=f"where the setup of {marker_bags.SHIPPED} goes (default: %(default)s)",
     )
-    bags.add_argument(
-        "--motion",
-        choices=[*sorted(SHIPPED), *(each.SHIPPED for each in (marker_bags, depth_bags, camera_bags, five_systems))],
-        help="only this one",
-    )
+    names = [*sorted(SHIPPED), *(each.SHIPPED for each in (marker_bags, depth_bags, camera_bags, five_systems))]
+    bags.add_argument("--motion", choices=names, metavar="NAME", help=f"only this one: {', '.join(names)}")
     bags.set_defaults(run=make_bags)
 
 

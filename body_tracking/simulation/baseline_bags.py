@@ -155,7 +155,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """``body_tracking simulate baseline``."""
     command = subparsers.add_parser("simulate baseline", description=__doc__.partition("\n\n")[2])
     tests = command.add_subparsers(metavar="TEST", required=True)
-    arm = tests.add_parser("arm", help="trials of a robot arm with three red balls: colour and depth images")
+    text = "trials of a robot arm with three red balls: colour and depth images"
+    arm = tests.add_parser("arm", help=text, description=text)
     arm.add_argument("--trials", type=int, default=3, metavar="N", help="of one motion (default: %(default)s)")
     arm.add_argument(
         "--delay",
@@ -165,7 +166,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="by which the camera's stamps follow the robot's (default: %(default)s)",
     )
     arm.set_defaults(run=_arm)
-    pendulum = tests.add_parser("pendulum", help="pendulums with a retro-reflective ball: infrared and depth images")
+    text = "pendulums with a retro-reflective ball: infrared and depth images"
+    pendulum = tests.add_parser("pendulum", help=text, description=text)
     pendulum.add_argument(
         "--lengths",
         default=",".join(map(str, LENGTHS)),

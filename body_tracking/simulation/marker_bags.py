@@ -263,7 +263,8 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="the bag to be written")
     parser.add_argument("--setup", type=Path, required=True, metavar="FOLDER", help="where to write the true setup")
-    parser.add_argument("--motion", default="slow_down", choices=tuple(MOTIONS), help="default: %(default)s")
+    text = f"default: %(default)s; one of {', '.join(MOTIONS)}"
+    parser.add_argument("--motion", default="slow_down", choices=tuple(MOTIONS), metavar="NAME", help=text)
     parser.add_argument("--seconds", type=float, default=4.0, metavar="S", help="of images (default: %(default)s)")
     parser.add_argument("--rate", type=float, default=60.0, metavar="HZ", help="images a second (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the person and the noise")
