@@ -118,7 +118,10 @@ def read_segments(path: Path, topic: str | None = None, body: str | None = None)
     name = None if angles is None else of_names.get(angles.names)
     if angles is None or name is None:
         if computed is None:
-            raise EvaluationError(f"{path}: holds {graph.MODEL_STATE}, but no joint angles; make them with replay")
+            lacking = "no joint angles" if angles is None else "joint angles of no convention of the body model"
+            raise EvaluationError(
+                f"{path}: holds {graph.MODEL_STATE}, but {lacking}; replay with --convention model makes them"
+            )
         if angles is not None:
             warnings.append(
                 f"{path}: its joint angles are of no convention of the body model; those compared here are of the "

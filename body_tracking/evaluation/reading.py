@@ -373,7 +373,7 @@ def read_estimate(path: Path, topic: str | None = None, body: str | None = None)
             if topic not in bag.topics and bodies(bag):
                 raise EvaluationError(
                     f"{path}: joint angles without skeletons, as markers give them; `body_tracking show {path}` "
-                    "compares them with the truth (--truth BAG, if another bag holds it)"
+                    "prints them, beside the truth where a bag holds that of these angles (--truth BAG)"
                 )
         made = _recorded(bag, topic, "; make some with replay, or choose one with --topic")
         angles = read_angles(bag, body)[1] if body is not None or bodies(bag) else None

@@ -127,6 +127,8 @@ def run(args: argparse.Namespace) -> int:
     table = summary(tracked.angles, tracked.true_angles)
     width = shutil.get_terminal_size((120, 24)).columns
     print(f"{table.text(width)}\n\n{table.note}\n", flush=True)  # drawing takes seconds
+    if args.truth is not None and not any(each.key == "rms_error" for each in table.columns):
+        print(f"no errors: {args.truth} holds no truth of these angles at these times")
     if args.csv is not None:
         write_csv(tracked.angles, args.csv)
         print(f"angles: {args.csv}")

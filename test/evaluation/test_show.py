@@ -248,6 +248,12 @@ def test_a_bag_without_truth_or_skeletons_is_shown_all_the_same(tmp_path: Path) 
     assert (tmp_path / "bare.png").read_bytes().startswith(PNG)
 
 
+def test_a_truth_that_does_not_hold_these_angles_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["show", str(bare(tmp_path / "bare")), "--truth", str(BAGS / "tpose_wave")]) == 0
+    shown = capsys.readouterr().out
+    assert "rms err" not in shown and "tpose_wave holds no truth of these angles at these times" in shown
+
+
 def test_bags_without_angles_are_reported_in_one_line(tmp_path: Path) -> None:
     angles = bare(tmp_path / "bare")
     with pytest.raises(EvaluationError, match="holds no joint angles"):
