@@ -12,7 +12,7 @@ import body_tracking
 from body_tracking.core.message_types import COMPRESSED_IMAGE, IMAGE, IMU, POINT_CLOUD
 from body_tracking.core.parameters import Value
 from body_tracking.markers import setup
-from body_tracking.pipeline.graph import SENSORS_INPUT
+from body_tracking.pipeline import graph
 from body_tracking.pipeline.roles import DEFAULT_FILTER, role_of
 from body_tracking.pipeline.system import Option
 from body_tracking.systems import OPTIONS
@@ -93,7 +93,10 @@ def unused(topics: Mapping[str, str], options: Mapping[str, Value]) -> str:
         taken = {part for each in given if isinstance(each, tuple) for name in each for part in name.split(":")}
         if source not in taken and not any(each for each in given if isinstance(each, str)):
             left.setdefault(takers, set()).add(source)
-    return "; ".join(f"{listed(takers, 'or')}: {', '.join(sorted(names))}" for takers, names in left.items())
+    sensors, computed = (options.get(name) for name in ("sensors", "computed"))
+    if isinstance(computed, tuple) and computed and sensors == computed and (there := graph.sensors_among(topics)):
+        left[("--sensors",)] = {*there} - {*computed}
+    return "; ".join(f"{listed(takers, 'or')}: {', '.join(sorted(names))}" for takers, names in left.items() if names)
 
 
 def unused_imus(options: Mapping[str, Value]) -> str:
@@ -103,7 +106,7 @@ def unused_imus(options: Mapping[str, Value]) -> str:
         options: of the graph.
     """
     alone = not options["sensors"]
-    if not options["imus"] or alone or options["depth"] or role_of(options).input == SENSORS_INPUT:
+    if not options["imus"] or alone or options["depth"] or role_of(options).input == graph.SENSORS_INPUT:
         return ""
     return f"the filter {options['filter'] or DEFAULT_FILTER} does not use the inertial sensors: --filter ekf does"
 

@@ -33,6 +33,10 @@ MARKERS = {"/left/balls": POINT_CLOUD, "/right/balls": POINT_CLOUD, "/markers/po
             f"{IMAGES}: camera1; --marker-setup: left",
         ),
         ({"sensors": ("kinect1",), "camera": ("camera1",), "marker_setup": "lab"}, "--depth: kinect1; --imus: pelvis"),
+        (
+            {"sensors": ("kinect1_mesh",), "computed": ("kinect1_mesh",), "depth": ("kinect1",), "marker_setup": "lab"},
+            f"{IMAGES}: camera1; --imus: pelvis; --sensors: kinect1",
+        ),
         ({"sensors": ("kinect1",), "camera_rig": "rig"}, "--depth: kinect1; --imus: pelvis; --marker-setup: left"),
     ],
 )
