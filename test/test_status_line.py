@@ -207,6 +207,20 @@ def test_the_recorder_rightly_waits_for_a_bag_that_has_not_begun() -> None:
     assert "bag_recorder" not in monitor.line(with_bag, 1.0, {})
 
 
+def test_several_angles_have_their_names() -> None:
+    monitor = monitor_without_node()
+    monitor._angles_topics = tuple(f"/humans/bodies/{each}/joint_states" for each in ("body1", "body2", "markers"))
+    options = options_of(sensors=(), marker_setup="lab")
+
+    def line(**rates: str) -> str:
+        values = {f"rate out /humans/bodies/{name}/joint_states": rate for name, rate in rates.items()}
+        monitor._statuses = {"joint_angles": NodeStatus("joint_angles: stream", 0, "", values, time.monotonic())}
+        return monitor.line(options, 1.0, {})
+
+    assert "| angles 16 Hz" in line(body1="15.9") and "| angles - Hz" in line()
+    assert "| angles body1 16, markers 30 Hz" in line(body1="15.9", body2="0.0", markers="30.1")
+
+
 def test_sensors_rightly_send_nothing_before_the_bag_plays() -> None:
     monitor = monitor_without_node()
     silent = "forearm_left: nothing has come yet"

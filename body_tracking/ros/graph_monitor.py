@@ -291,9 +291,11 @@ class GraphMonitor:
 
         sensors = " ".join(f"{name} {rate('fusion', 'in', graph.skeleton_topic(name))}" for name in sensors_of(options))
         skeletons = f"{sensors}, fused {rate('fusion', 'out', graph.FUSED)}, " if sensors else ""
-        rates = [self._angles_rate(topic, fresh) for topic in self._angles_topics]
-        # the people with angles; the first one if there are none
-        angles = " ".join([each for each in rates if each not in ("-", "0")] or rates[:1])
+        rates = {topic.split("/")[-2]: self._angles_rate(topic, fresh) for topic in self._angles_topics}
+        # of the people with angles, and of markers; of the first one if there are none
+        known = {each: rate for each, rate in rates.items() if rate not in ("-", "0")}
+        named = ", ".join(f"{each} {rate}" for each, rate in known.items())
+        angles = named if len(known) > 1 else next(iter((known or rates).values()), "-")
         return f"{skeletons}angles {angles} Hz"
 
     def _angles_rate(self, topic: str, fresh: Mapping[str, NodeStatus]) -> str:
