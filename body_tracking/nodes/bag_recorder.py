@@ -31,27 +31,27 @@ PARAMETERS = (
         "folder",
         "",
         "the bag; an existing one is continued. Empty for body_tracking_<date and time> in the working directory, a "
-        "new one at each start of a recording. May change between recorder/stop and recorder/start",
+        "new one at each start of a recording. May change while nothing is recorded",
         live=True,
     ),
     Parameter(
         "topics",
         (),
         "record only these topics; empty for all that appear in the node's namespace, /tf and /diagnostics. May change "
-        "likewise",
+        "while nothing is recorded",
         live=True,
     ),
     Parameter(
         "exclude",
         ("/clock", "/rosout", "/parameter_events"),
-        "topics not to record, where topics is empty. May change likewise",
+        "topics not to record, where topics is empty. May change while nothing is recorded",
         live=True,
     ),
     Parameter(
         "model_covariance",
         False,
         "where topics is empty: also record /filtered/model_covariance (of each person); with ekf it is most of a "
-        "recording, and body_tracking replay computes it again. May change likewise",
+        "recording, and body_tracking replay computes it again. May change while nothing is recorded",
         live=True,
     ),
     Parameter(

@@ -39,7 +39,7 @@ class EkfParameters(OrientationParameters):
     )
     bone_correlation: float = number_field(
         BONE_CORRELATION,
-        "correlation of these distances at the two joints of a bone, for the deviations of angles: the default is a "
+        "correlation of the errors of the two joints of a bone, for the deviations of angles: the default is a "
         "Kinect's; 0 for joints with independent errors, as those of cameras",
         "1",
         0.0,
