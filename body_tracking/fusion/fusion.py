@@ -42,9 +42,12 @@ _WIDTHS = ((0.15, 0.6), (0.05, 0.4))
 MAX_OUTPUT_GAP = round(0.065 * NANOSECONDS)
 """Time without an output after which one is made at another sensor's frame, nanoseconds."""
 
+_SLOWER = 1.5
+"""Ratio of frame periods from which the reference is slower than another sensor, as a Kinect v2 in the dark is."""
+
 SHARE_OF_PERIOD = 0.75
-"""The same while the reference is silent, in its periods: with 0.75 every frame of one other sensor gives an output, of
-two others not each (14 outputs a second with :data:`MAX_OUTPUT_GAP`, 27 with this)."""
+"""The same while the reference is silent or slower, in periods of the fastest sensor: with 0.75 every frame of one
+other sensor gives an output, of two others not each (14 outputs a second with :data:`MAX_OUTPUT_GAP`, 27 with this)."""
 
 EXTRAPOLATE = 0.05
 """Longest time by which a sensor's older frame is carried forward, seconds."""
@@ -258,9 +261,13 @@ class Fusion(PlacedSensors[_Sensor]):
     def _least_gap(self, stamp: int) -> int:
         """Time since the last output that a frame of another sensor than the reference needs for the next one."""
         reference = self._sensors[self.reference]
-        if not reference.frames or stamp - reference.frames[-1].stamp_ns <= self.parameters.silence * NANOSECONDS:
+        if not reference.frames:
             return MAX_OUTPUT_GAP
-        return round(SHARE_OF_PERIOD * reference.rhythm.period * NANOSECONDS)
+        fastest = min(source.rhythm.period for source in self._sensors.values() if source.frames)
+        silent = stamp - reference.frames[-1].stamp_ns > self.parameters.silence * NANOSECONDS
+        if silent or reference.rhythm.period > _SLOWER * fastest:
+            return round(SHARE_OF_PERIOD * fastest * NANOSECONDS)
+        return MAX_OUTPUT_GAP
 
     def _last_output(self, stamp: int) -> int:
         """Time of the last output or, at the start, of the first frame."""

@@ -274,6 +274,20 @@ def test_output_continues_while_the_reference_is_silent() -> None:
     assert errors(fused)[30:].max() < 0.05
 
 
+def test_a_slow_reference_does_not_halve_the_rate_of_the_output() -> None:
+    """A Kinect v2 in the dark gives 15 frames a second."""
+    slow, kept = frames(6.0), 0
+    given_frames = []
+    for name, seen, at in slow:
+        kept += name == "kinect1"
+        if name == "kinect2" or kept % 2:
+            given_frames.append((name, seen, at))
+    fused = run(fusion(), given_frames)
+    stamps = np.array([each.stamp for each in fused])
+    assert np.diff(stamps).min() > 0.0 and len(stamps) > 170
+    assert errors(fused)[30:].max() < 0.05
+
+
 @pytest.mark.parametrize("sensor", ["kinect1", "kinect2"])
 @pytest.mark.parametrize("seconds", some([1.2, 0.3, 3.0]))
 def test_a_temporary_reversal_in_one_sensor_is_swapped_back(sensor: str, seconds: float) -> None:
