@@ -43,6 +43,10 @@ _WATCH_NS: Final = NANOSECONDS // 4
 second."""
 _SEARCH_NS: Final = NANOSECONDS // 10
 """Nanoseconds after which a search is finished with the next images, at low frame rates."""
+_MIN_POINTS: Final = 3.0
+"""Least mean number of points in that time: those of one target."""
+_UNRECOGNISED_NS: Final = 2 * NANOSECONDS
+"""Nanoseconds of points without a target after which that is reported."""
 _LONGEST_NS: Final = NANOSECONDS // 5
 """Longest time between two frames for a rate by their difference, nanoseconds."""
 CONVENTION: Final = "markers"
@@ -286,17 +290,40 @@ class TrackerStage(Stage):
             self._framed = {load_chain(setup.file_of(values["setup"], setup.CHAIN, "fit")).targets[0]}
         if self._framed:
             self.outputs += (Port(graph.TF, Frames(), RELIABLE, optional=True),)
+        self._points = 0.0
+        self._from_ns = self._to_ns = 0
 
     def take(self, topic: str, payload: Points, now: Now) -> Iterable[Output]:
         poses = self.tracker.update(payload)
+        self._watch(payload, found=bool(poses))
         for pose in poses:
             yield Output(setup.pose_topic(pose.name), pose, pose.stamp_ns)
         frames = [(pose.name, pose.rotation, pose.translation) for pose in poses if pose.name in self._framed]
         if frames:
             yield Output(graph.TF, (payload.stamp_ns, payload.frame_id, frames), payload.stamp_ns)
 
+    def _watch(self, payload: Points, *, found: bool) -> None:
+        """Average the number of points since the last target was found."""
+        if found or not 0 < self._from_ns < payload.stamp_ns:
+            self._from_ns, self._points = payload.stamp_ns, 0.0
+        else:
+            share = (payload.stamp_ns - self._to_ns) / (payload.stamp_ns - self._from_ns)
+            self._points += share * (len(payload.positions) - self._points)
+        self._to_ns = payload.stamp_ns
+
     def reset(self, topic: str) -> None:
         self.tracker.reset()
+        self._from_ns = self._to_ns = 0
+
+    def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
+        """Warn of points among which there is no target."""
+        if self._to_ns - self._from_ns < _UNRECOGNISED_NS or self._points < _MIN_POINTS:
+            return 0, "", {}
+        text = (
+            f"no target among {self._points:.0f} points: was a camera moved since the calibration, or is "
+            f"{setup.TARGETS} of other targets?"
+        )
+        return 1, text, {}
 
     @property
     def counters(self) -> Mapping[str, int]:

@@ -11,7 +11,7 @@ import os
 import threading
 import warnings
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing.connection import Connection
@@ -38,10 +38,12 @@ class Written:
     Attributes:
         frames: number of joint angle messages.
         counters: of the filter, and of unusable messages.
+        problems: of the stages at the end, in words.
     """
 
     frames: int
     counters: Mapping[str, int]
+    problems: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,8 +102,8 @@ class Downstream:
 
     def __init__(self, job: Job, follow: Callable[[Job], Last | ForkedDownstream] | None = None) -> None:
         filters = [each for each in job.stages if is_second(each.executable) and not _is_last(each.executable)]
-        self._stages = [each.make() for each in filters]
-        self._runner = OfflineRunner(self._stages, BAG_WIRE, self._published, job.topics)
+        self._stages = {each.node: each.make() for each in filters}
+        self._runner = OfflineRunner([*self._stages.values()], BAG_WIRE, self._published, job.topics)
         own = {p.topic: (p.codec.type_name, p.qos) for p in self._runner.outputs if not p.optional}
         rest = [each for each in job.stages if each not in filters]
         self._next = (follow or Last)(replace(job, stages=rest, topics={**job.topics, **own}))
@@ -118,8 +120,8 @@ class Downstream:
         self._runner.finish(at_ns)
         written = self._next.finish(at_ns)
         # both may have counted the same message
-        counters = Counter(_counters(self._stages, self._runner)) | Counter(written.counters)
-        return Written(written.frames, counters)
+        counters = Counter(_counters(self._stages.values(), self._runner)) | Counter(written.counters)
+        return Written(written.frames, counters, (*problems_of(self._stages, at_ns), *written.problems))
 
     @property
     def path(self) -> Path | None:
@@ -135,8 +137,8 @@ class Last:
     """Runs the stages after the filter, and writes every message; errors as of :class:`Downstream`."""
 
     def __init__(self, job: Job) -> None:
-        self._stages = [each.make() for each in job.stages if _is_last(each.executable)]
-        self._runner = OfflineRunner(self._stages, BAG_WIRE, self._published, job.topics)
+        self._stages = {each.node: each.make() for each in job.stages if _is_last(each.executable)}
+        self._runner = OfflineRunner([*self._stages.values()], BAG_WIRE, self._published, job.topics)
         self._covariance = job.model_covariance
         self._frames = 0
         self._writer = BagWriter(job.out, overwrite=job.overwrite)
@@ -163,7 +165,7 @@ class Last:
             self._writer.close()
         else:
             self._writer.discard()
-        return Written(self._frames, _counters(self._stages, self._runner))
+        return Written(self._frames, _counters(self._stages.values(), self._runner), problems_of(self._stages, at_ns))
 
     @property
     def path(self) -> Path:
@@ -173,12 +175,18 @@ class Last:
         self._writer.discard()
 
 
+def problems_of(stages: Mapping[str, Stage], at_ns: int) -> tuple[str, ...]:
+    """What is wrong in stages, by node, at a time, in words."""
+    states = {node: stage.state(at_ns) for node, stage in stages.items()}
+    return tuple(f"{node}: {text}" for node, (level, text, _) in states.items() if level and text)
+
+
 def _is_last(executable: str) -> bool:
     """Whether a stage comes after the filter."""
     return NODES[executable].place > Place.FILTER
 
 
-def _counters(stages: Sequence[Stage], runner: OfflineRunner) -> dict[str, int]:
+def _counters(stages: Iterable[Stage], runner: OfflineRunner) -> dict[str, int]:
     counters = {
         f"{'filter' if stage.NAME == 'skeleton_filter' else stage.NAME} {name}": count
         for stage in stages

@@ -291,8 +291,7 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
         for node, stage in first.items():
             counters.update({f"{node} {name}": count for name, count in stage.counters.items()})
         counters |= Counter(written.counters)  # both halves may have counted the same message
-        states = {node: stage.state(bag.end_ns) for node, stage in first.items()}
-        problems = [f"{node}: {text}" for node, (level, text, _) in states.items() if level and text]
+        problems = [*forked.problems_of(first, bag.end_ns), *written.problems]
         problems += _left_out(counters)
         if not written.frames:
             given = ", ".join(settings.sensors or sources)

@@ -18,11 +18,11 @@ from body_tracking.core.parameters import check_all
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
 from body_tracking.markers import setup
 from body_tracking.markers.codecs import Balls, SpacePoints
-from body_tracking.markers.observations import ImageBalls
+from body_tracking.markers.observations import ImageBalls, Points
 from body_tracking.markers.rig import Rig
 from body_tracking.markers.rig_monitor import Fault, Finding
 from body_tracking.markers.rig_storage import save_rig
-from body_tracking.markers.stages import DetectorStage, TriangulationStage
+from body_tracking.markers.stages import DetectorStage, TrackerStage, TriangulationStage
 from body_tracking.messages.base import to_header
 from body_tracking.messages.images import array_to_image
 from body_tracking.pipeline.offline import OfflineRunner
@@ -61,6 +61,31 @@ class Watched:
             self.frame += 1
             list(self.stage.poll(stamp_ns))
         return self.stage.state(0)[1]
+
+
+def test_points_without_a_target_are_named_after_two_seconds() -> None:
+    """As where a camera was moved along the epipolar lines, or the file is of other targets."""
+    folder = Path(__file__).resolve().parents[2] / "config" / "five_systems"
+    stage, rng = TrackerStage(check_all(TrackerStage.PARAMETERS, {"setup": str(folder)})), np.random.default_rng(0)
+
+    def text_after(first: int, last: int, points: int) -> str:
+        for frame in range(first, last):
+            covariance = np.broadcast_to(1e-8 * np.eye(3), (points, 3, 3))
+            seen = Points(
+                START_NS + frame * NANOSECONDS // 30,
+                "left_optical_frame",
+                rng.normal(size=(points, 3)),
+                covariance,
+                np.empty((points, 0), np.intp),
+            )
+            list(stage.take(setup.POINTS, seen, Now(seen.stamp_ns, seen.stamp_ns)))
+        return stage.state(0)[1]
+
+    assert text_after(0, 30, 0) == ""
+    assert text_after(30, 50, 10) == ""
+    assert text_after(50, 300, 10).startswith("no target among 9 points: was a camera moved since the calibration")
+    stage.reset(setup.POINTS)
+    assert text_after(0, 2, 10) == "" and text_after(2, 90, 2) == ""
 
 
 def turn(rng: np.random.Generator) -> FloatArray:
