@@ -64,6 +64,7 @@ def test_a_rig_in_a_namespace_follows_changes_of_filter_and_convention_and_ends_
         assert bag.whole and bag.topics[f"/lab{ANGLES}"].count > 0
 
 
+@pytest.mark.slow  # CI runs it in `make test-ros2`
 @pytest.mark.skipif(bool(MISSING), reason=REASON)
 def test_colour_and_depth_cameras_have_a_launch_of_their_own(tools: Tools) -> None:
     angles, deviations = (tools.bench.collect(JointState, topic) for topic in (ANGLES, DEVIATIONS))
