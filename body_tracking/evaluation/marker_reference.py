@@ -98,7 +98,7 @@ def mounted_on(targets: Iterable[str], mounted: Iterable[str]) -> dict[str, str]
             targets on segments.
     """
     there = tuple(targets)
-    told = {}
+    given = {}
     for entry in mounted:
         target, equals, name = entry.partition("=")
         segment = segment_of(name)
@@ -106,12 +106,12 @@ def mounted_on(targets: Iterable[str], mounted: Iterable[str]) -> dict[str, str]
             raise EvaluationError(f"--mounted {entry}: expected TARGET=SEGMENT, segments: {', '.join(SEGMENTS)}")
         if target not in there:
             raise EvaluationError(f"--mounted {entry}: no such target; there are {', '.join(there)}")
-        told[target] = segment
+        given[target] = segment
     found = {}
     for target in there:
         plain = _plain(target)
         alias = next((plain.replace(word, other) for word, other in _OTHER_NAMES.items() if word in plain), plain)
-        segment = told.get(target) or segment_of(alias)
+        segment = given.get(target) or segment_of(alias)
         if segment is not None:
             found[target] = segment
     for segment in set(found.values()):

@@ -268,7 +268,7 @@ def _facts(result: Evaluation) -> tuple[tuple[str, str], ...]:
         ("estimate", f"{estimate.source} {estimate.topic}: {len(estimate.stamps_ns)} frames"),
         ("truth", f"{truth.source} {truth.topic}".rstrip() + f": {len(truth.stamps_ns)} frames"),
         ("compared", f"{last - first:.2f} s, from {first:.2f} s on, of the truth's {length:.2f} s"),
-        ("delay", "cannot be told" if np.isnan(result.delay) else delay),
+        ("delay", "unknown" if np.isnan(result.delay) else delay),
         *(("" if number else "angles", text) for number, text in enumerate(_angles_in_words(result))),
         *(("" if number else "joints", text) for number, text in enumerate(_joints_in_words(result))),
     ]

@@ -172,7 +172,7 @@ def compare(trials: Sequence[Trial]) -> ArmResult:
     delay = find_delay(first.tracked, first.truth)
     if np.isnan(delay):
         raise ArmError(
-            f"{first.name}: delay of the camera cannot be told; it is over 0.5 s, or the arm moves too little or for "
+            f"{first.name}: delay of the camera is unknown; it is over 0.5 s, or the arm moves too little or for "
             "less than 2 s"
         )
     alignment = align(first.tracked, first.truth, delay)

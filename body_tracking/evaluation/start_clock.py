@@ -70,7 +70,7 @@ def start_clock(
                 )
         missing = [name for name in own if name not in found]
         if missing:
-            notes.append(f"the clocks' offset is not told by {', '.join(missing)}, which move little or unlike")
+            notes.append(f"the clocks' offset does not follow from {', '.join(missing)}, which move little or unlike")
         return found[best], notes
     rms = ", ".join(
         f"{name} {np.degrees(_rms(theirs.values)):.0f}, its segment {np.degrees(_rms(mine.values)):.0f}"

@@ -30,7 +30,7 @@ _PLACE: Final = 5.0
 """Pixels of motion after which a ball's epipolar distance counts as independent."""
 _RATE: Final = 60.0
 """Approximate frame rate, Hz."""
-_FELT: Final = 1e-2
+_INFORMATIVE: Final = 1e-2
 """Information of the distances about a calibration parameter, in units of its prior, below which it is not fitted."""
 _CUT: Final = 9.0
 """Largest cost of a residual, squared standard deviations."""
@@ -225,7 +225,7 @@ class RigMonitor:
         share = np.concatenate([each.share for each in self._window])
         by_turn = np.concatenate([each.by_turn for each in self._window])
         by_delay = np.concatenate([each.by_delay for each in self._window])
-        by_calibration = _felt(np.concatenate([each.by_calibration for each in self._window]), variance)
+        by_calibration = _determined(np.concatenate([each.by_calibration for each in self._window]), variance)
         limits = _REACH / float(self._geometry.focal.mean()), _MAX_DELAY
         nothing = _explain(distance, variance, share, by_calibration, np.zeros((len(distance), 0)), 1.0)
         yield
@@ -343,10 +343,10 @@ def _velocities(last: ImageBalls, image: ImageBalls) -> FloatArray:
     return velocities
 
 
-def _felt(by_calibration: FloatArray, variance: FloatArray) -> FloatArray:
+def _determined(by_calibration: FloatArray, variance: FloatArray) -> FloatArray:
     """(n, s) derivative by the combinations of the calibration's unknowns (n, r) that the distances determine."""
     values, vectors = np.linalg.eigh(by_calibration.T @ (by_calibration / variance[:, None]))
-    return np.asarray(by_calibration @ vectors[:, values > _FELT])
+    return np.asarray(by_calibration @ vectors[:, values > _INFORMATIVE])
 
 
 def _explain(

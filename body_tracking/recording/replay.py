@@ -327,7 +327,7 @@ def _without(settings: ReplaySettings, bag: BagReader) -> bool:
 def _left_out(counters: Mapping[str, int]) -> list[str]:
     """Warnings of measurements that a driver repeated, or that were recorded too late for ``ekf``, if many."""
     repeated = {name.partition("repeated ")[2]: count for name, count in counters.items() if "repeated " in name}
-    found = [f"{count} {name}: the same again and again, not used" for name, count in sorted(repeated.items())]
+    found = [f"{count} repeated {name} were not used" for name, count in sorted(repeated.items())]
     late = counters.get("filter too_late", 0)
     if late <= _MANY * sum(counters.get(f"filter {name}", 0) for name in ("frames", "orientations")):
         return found
