@@ -367,6 +367,31 @@ def test_one_sensor_that_sees_an_arm_elsewhere_does_not_move_it_there() -> None:
     assert np.mean(np.array(away) < 0.15) > 0.88, (np.mean(np.array(away) < 0.15), restarts)
 
 
+def test_deviations_do_not_alternate_where_one_of_two_sensors_sees_an_arm_elsewhere() -> None:
+    """After a frame of either sensor they are nearly those after the other's."""
+    ratios: list[float] = []
+    for seed in range(draws(2, 20)):
+        truth = random_truth(seed, 3.0)
+        arm, offset = arm_elsewhere(np.random.default_rng([seed, 9]))
+        estimator, angles = ExtendedKalmanFilter(), None
+        after: dict[str, FloatArray] = {}
+        frames = zip(measured(truth).skeletons, measured(truth, seed=1).skeletons, truth.times, strict=True)
+        for front, beside, time in frames:
+            for name, skeleton in (("front", front), ("beside", beside)):
+                if time > 2.0 and name == "beside":
+                    positions = skeleton.positions.copy()
+                    positions[arm] += offset
+                    skeleton = replace(skeleton, positions=positions)
+                stamp_ns = skeleton.stamp_ns + (NANOSECONDS // 100 if name == "beside" else 0)
+                if estimator.take(replace(skeleton, stamp_ns=stamp_ns), name) and time > 1.9:
+                    angles = angles_of(known(estimator), MODEL, "model", angles)
+                    after[name] = angles.position_stddev
+            if time > 2.1:
+                ratios.append(float((after["beside"] / after["front"]).max()))
+    # 99.6 % over 20 people, median 1.04; if a single rejected frame counted, none, median 9.4
+    assert np.mean(np.array(ratios) < 1.5) > 0.9, np.quantile(ratios, [0.5, 0.9])
+
+
 ORIGIN = np.array([-3.0, 5.0, 0.7])
 
 

@@ -222,8 +222,13 @@ class SkeletonUpdate:
     def _disputed(
         self, state: State, measurement: Measurement, innovation: FloatArray, rejected_for: FloatArray
     ) -> FloatArray:
-        """(57,) ``State.disputed`` after a frame: 0 for accepted points, unchanged for unseen ones."""
-        share = np.minimum(rejected_for / max(self._parameters.reacquire_after, 1e-3), 1.0)
+        """(57,) ``State.disputed`` after a frame: 0 for accepted points, unchanged for unseen ones.
+
+        A single rejected frame counts as an outlier. Otherwise the deviations of an arm that one of two sensors sees
+        elsewhere would alternate: 104 degrees after each of its frames, 30 after each of the other's.
+        """
+        before = np.where(rejected_for > 0.0, state.rejected_for, 0.0)
+        share = np.minimum(before / max(self._parameters.reacquire_after, 1e-3), 1.0)
         disputed = np.sqrt(share).repeat(3) * np.clip(innovation, -_REACH, _REACH)
         return np.where(measurement.measured.repeat(3), disputed, state.disputed)
 
