@@ -169,7 +169,7 @@ def places(replayed_wave: Path, tmp_path_factory: pytest.TempPathFactory) -> dic
             r"twist: is another recording than .*: no frame of /kinect1/skeleton is in both",
         ),
         (["{twist}"], r"no topic /filtered/skeleton \(skeletons there: /ground_truth/skeleton, /kinect1"),
-        (["{angles}"], r"angles: joint angles without skeletons, .*`body_tracking show \S*angles` compares them"),
+        (["{angles}"], r"angles: joint angles without skeletons, .*`body_tracking show \S*angles` prints them"),
         (["{wave}", "--topic", "/calibration"], r"/calibration holds geometry_msgs/msg/TransformStamped, expected"),
         (["{wave}", "--body", "bob"], r"no joint angles of 'bob' \(there: body1\)"),
         (["{text}"], r"notes\.txt: not an mcap file"),
