@@ -43,7 +43,8 @@ MAX_OUTPUT_GAP = round(0.065 * NANOSECONDS)
 """Time without an output after which one is made at another sensor's frame, nanoseconds."""
 
 _SLOWER = 1.5
-"""Ratio of frame periods from which the reference is slower than another sensor, as a Kinect v2 in the dark is."""
+"""Ratio of frame periods from which the reference is slower than another sensor, as a Kinect v2 in the dark is.
+With every second frame of it left out three recordings gave 15 outputs a second, now 19 to 28, with the same errors."""
 
 SHARE_OF_PERIOD = 0.75
 """The same while the reference is silent or slower, in periods of the fastest sensor: with 0.75 every frame of one

@@ -28,6 +28,9 @@ class FilterRole:
     convention: str = graph.POSITIONAL
 
 
+NOTABLE_LATE: Final = 0.02
+"""Share of the measurements that the filter may leave out as too late without a warning."""
+
 ROLES: Final[Mapping[str, FilterRole]] = {
     "lkf_zero_velocity": FilterRole(),
     "lkf_constant_velocity": FilterRole(),

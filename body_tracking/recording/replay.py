@@ -30,7 +30,7 @@ from body_tracking.node_parameters import parameters_for
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.offline import OfflineRunner
 from body_tracking.pipeline.people import SubjectSelector
-from body_tracking.pipeline.roles import ROLES
+from body_tracking.pipeline.roles import NOTABLE_LATE, ROLES
 from body_tracking.pipeline.system import Options
 from body_tracking.recording import forked
 from body_tracking.recording.finding import advice_for, unused, unused_imus
@@ -56,8 +56,6 @@ class ReplayError(BodyTrackingError):
     """Raised when the bag lacks the input of the graph."""
 
 
-_MANY: Final = 0.02
-"""Share of the measurements that the filter may leave out as too late without a warning."""
 OFFLINE: Final[Mapping[str, Value]] = {"deadline": 10.0}
 """Time limits of the stages, seconds: with those of a live graph, offline results would depend on the machine; with
 1 s a busy one lost a frame."""
@@ -329,7 +327,7 @@ def _left_out(counters: Mapping[str, int]) -> list[str]:
     repeated = {name.partition("repeated ")[2]: count for name, count in counters.items() if "repeated " in name}
     found = [f"{count} repeated {name} were not used" for name, count in sorted(repeated.items())]
     late = counters.get("filter too_late", 0)
-    if late <= _MANY * sum(counters.get(f"filter {name}", 0) for name in ("frames", "orientations")):
+    if late <= NOTABLE_LATE * sum(counters.get(f"filter {name}", 0) for name in ("frames", "orientations")):
         return found
     return [*found, f"skeleton_filter: {late} measurements came more than 0.2 s late and were not used"]
 

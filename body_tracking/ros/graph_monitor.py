@@ -26,7 +26,7 @@ from body_tracking.messages.base import MessageError, to_nanoseconds
 from body_tracking.messages.diagnostics import statuses
 from body_tracking.messages.node_status import NodeStatus, update_statuses
 from body_tracking.pipeline import graph
-from body_tracking.pipeline.roles import ROLES, role_of
+from body_tracking.pipeline.roles import NOTABLE_LATE, ROLES, role_of
 from body_tracking.pipeline.system import Options
 from body_tracking.ros.bag_topics import to_profile
 from body_tracking.ros.executor import BatchNode, LeanExecutor
@@ -40,8 +40,6 @@ _SHOWING = ("viewer", "body_markers")
 """Nodes that show the latest messages, and leave out others on purpose."""
 _NOTABLE_LOSS, _FEW = 0.01, 10
 """Share of a node's received messages, and a number that is lost where a node has just started."""
-_NOTABLE_LATE = 0.02
-"""Share of the filter's received messages that came too late to be used."""
 _REPORTED_S = 1.5
 """Seconds of a bag after which each node has reported what it gets of it."""
 _FRESH = 3.0
@@ -257,7 +255,7 @@ class GraphMonitor:
         """That ``ekf`` left out many measurements, and what helps; empty where it used nearly all."""
         status = self._statuses.get("skeleton_filter", NodeStatus("", 0, ""))
         late, received = (status.number(key) or 0.0 for key in ("too_late", "received"))
-        if late <= _NOTABLE_LATE * received:
+        if late <= NOTABLE_LATE * received:
             return ""
         advice = "--rate 0.5 plays more slowly" if bag else "see docs/troubleshooting.md"
         return f"; {late:.0f} measurements came too late for skeleton_filter; {advice}"
