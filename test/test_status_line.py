@@ -135,6 +135,26 @@ def test_a_bag_that_waits_names_the_nodes_that_it_waits_for() -> None:
     assert line.strip() == "1.0 s (the bag plays once these nodes have started: fusion, joint_angles)"
 
 
+def test_a_bag_that_begins_or_is_at_its_end_has_no_rates() -> None:
+    """Rates of nodes that have not reported yet, or of a bag that stays at its end, look like silent sensors."""
+    monitor, options = monitor_without_node(), options_of(sensors=("kinect1",), bag="arm")
+    monitor._angles_topics, monitor.angles, monitor.clock_ns = ("/humans/bodies/body1/joint_states",), 9, 1
+    rates = {"rate in /kinect1/skeleton": "28", "rate out /fused/skeleton": "28"}
+
+    def line(position: str, text: str, fusion: dict[str, str], angles: str) -> str:
+        now = time.monotonic()
+        monitor._statuses = {
+            "bag_player": NodeStatus("", 0, text, {"position s": position, "duration s": "15.4"}, received=now),
+            "joint_angles": NodeStatus("", 0, "", {"rate out /humans/bodies/body1/joint_states": angles}, received=now),
+            "fusion": NodeStatus("", 0, "", fusion, received=now),
+        }
+        return monitor.line(options, 10.0, {}).strip()
+
+    assert line("0.8", "playing", {}, "26") == "10.0 s (bag 0.8/15.4 s) | calibration: none"
+    assert "kinect1 28, fused 28, angles 28 Hz" in line("5.0", "playing", rates, "28")
+    assert line("15.4", "at the end", rates, "0") == "10.0 s (the bag is at its end) | calibration: none"
+
+
 def test_a_narrow_terminal_shows_the_whole_status_over_several_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "40")
     master, terminal = pty.openpty()

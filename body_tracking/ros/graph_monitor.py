@@ -224,14 +224,17 @@ class GraphMonitor:
             )
             parts[0] += f" (the bag plays once {which})"
         else:
-            if player is not None:
+            ended = player is not None and player.text == "at the end"  # there it waits for the page
+            if ended:
+                parts[0] += " (the bag is at its end)"
+            elif player is not None:
                 parts[0] += f" (bag {position:.1f}/{player.number('duration s') or 0.0:.1f} s)"
             elif not fresh:
                 parts[0] += " (the nodes are starting)"
-            parts.append(self._rates(options, fresh))
-            delay = self._delay(options, fresh)
-            if delay:
-                parts.append(delay)
+            rates = self._rates(options, fresh)
+            if not ended and not (starts and " -" in rates):
+                parts.append(rates)
+                parts += filter(None, [self._delay(options, fresh)])
             parts += calibration_part(fresh.get("calibration"), sensors_of(options))
             if not options["bag"] and elapsed > _SILENT_S:
                 parts += self._silent_sensors(options, fresh)
