@@ -41,6 +41,7 @@ def _pose(rig: Rig, index: int) -> list[str]:
     covariance = rig.covariance[start : start + 6, start : start + 6]
     turn = so3.rotation_vectors(rig.rotations[index])
     shift = rig.translations[index]
+    place = -1e3 * rig.rotations[index].T @ shift
     angle, distance = float(np.linalg.norm(turn)), float(np.linalg.norm(shift))
     # the rotation vector is its own eigenvector: the angle changes by the component of w along it
     angle_deviation = float(np.sqrt(turn @ covariance[:3, :3] @ turn)) / max(angle, 1e-12)
@@ -50,4 +51,6 @@ def _pose(rig: Rig, index: int) -> list[str]:
         f"{np.degrees(angle):.3f} +- {np.degrees(angle_deviation):.3f} deg",
         f"  t           [{shift[0] * 1e3:.2f} {shift[1] * 1e3:.2f} {shift[2] * 1e3:.2f}] mm, "
         f"{distance * 1e3:.2f} +- {distance_deviation * 1e3:.2f} mm",
+        f"  at          {place[0]:.1f} {place[1]:.1f} {place[2]:.1f} mm in the first camera's frame; R and t convert "
+        "from that frame to this camera's",
     ]

@@ -82,6 +82,11 @@ def test_nine_real_pairs_are_calibrated_to_a_fifth_of_a_pixel(shared_data: Path)
     text = table(calibration)  # printed by `markers calibrate`
     assert re.search(r"camera left\n  fx +533\.\d\d \+- 0\.3\d px\n", text)
     assert re.search(r"t +\[-83\.\d\d .* mm, 83\.\d\d \+- 0\.0\d mm\n", text)
+    place = re.search(r"at +(\S+) (\S+) (\S+) mm in the first camera's frame", text)  # as `markers wand` prints it
+    rig = calibration.rig
+    assert place and np.allclose(
+        -1e3 * rig.rotations[1].T @ rig.translations[1], [*map(float, place.groups())], atol=0.06
+    )
     assert re.search(r"residual +x 0\.1\d\d px, y 0\.1\d\d px; as OpenCV gives it, of the 2D norm: 0\.2\d\d px", text)
 
 
