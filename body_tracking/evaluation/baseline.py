@@ -117,7 +117,7 @@ def pendulum_report(pendulums: Sequence[Pendulum]) -> Report:
     )
     known = np.abs(errors[np.isfinite(errors)])
     mean = float(known.mean()) if len(known) else float("nan")
-    facts = [("error", f"{mean:.4f} Hz, mean of absolute errors")] if len(known) else []
+    facts = [("error", f"{1e3 * mean:.3f} mHz, mean of absolute errors")] if len(known) else []
     return Report("pendulum", tuple(facts), {"mean_absolute_error_hz": numbered(mean)}, (table,))
 
 

@@ -74,7 +74,9 @@ def test_a_pendulum_in_a_bag(few: Path, tmp_path: Path, capsys: pytest.CaptureFi
     assert row["amplitude"] == pytest.approx(12.0, abs=1.0)
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert main(arguments[:-2]) == 0
-    assert f"{row['measured']:.4f}" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert f"{row['measured']:.4f}" in text
+    assert f"{abs(row['error']):.3f} mHz, mean of absolute errors" in text  # in hertz it would be 0.0000
 
 
 @pytest.mark.slow
