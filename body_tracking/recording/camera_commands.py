@@ -39,17 +39,19 @@ def people_in(image: NDArray[np.uint8], model: PoseModel, people: int) -> list[L
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """``body_tracking camera``."""
-    command = subparsers.add_parser("camera", description=__doc__)
+    command = subparsers.add_parser(
+        "camera", description="The networks that find people in images, and pictures of what they find."
+    )
     actions = command.add_subparsers(metavar="ACTION", required=True)
     text = "fetch the networks, if they are not there (MediaPipe's, Apache licence 2.0; 35 MB by pip)"
     model = actions.add_parser("model", help=text, description=text)
-    model.add_argument("folder", type=Path, nargs="?", help="where to (default: the user's cache)")
+    model.add_argument("folder", type=Path, nargs="?", metavar="FOLDER", help="where to (default: the user's cache)")
     model.set_defaults(run=_model)
     text = "draw the people in an image"
     show = actions.add_parser("show", help=text, description=text)
-    show.add_argument("image", type=Path, help="PNG or JPEG file")
+    show.add_argument("image", type=Path, metavar="IMAGE", help="PNG or JPEG file")
     show.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="picture to write")
-    show.add_argument("--people", type=int, default=6, metavar="N", help="the largest number of people (6)")
+    show.add_argument("--people", type=int, default=6, metavar="N", help="the largest number of people (default: 6)")
     show.add_argument("--pose-model", type=Path, metavar="FOLDER", help="folder of the networks")
     show.set_defaults(run=_show)
 

@@ -358,7 +358,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         nargs="+",
         type=Path,
         metavar="FILE",
-        help=".csv, .csv.gz, .skeleton, .mvnx, .mvnx.gz, .c3d, or a folder of colour and depth images",
+        help=".csv, .csv.gz, .skeleton, .mvnx, .mvnx.gz, .c3d, or a folder of colour and depth images or of "
+        "the NTU motion capture data set",
     )
     parser.add_argument("-o", "--output", required=True, type=Path, metavar="BAG", help="the bag (a folder) to make")
     parser.add_argument(

@@ -382,7 +382,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         action="append",
         required=True,
         metavar="NAME=FOLDER",
-        help="a camera and its images, in the order of those of the others; the first is the rig's frame",
+        help="a camera and its images, in the order of those of the others; once for each camera",
     )
     parser.add_argument("--columns", type=int, required=True, metavar="N", help="inner corners in a row")
     parser.add_argument("--rows", type=int, required=True, metavar="N", help="rows of inner corners")
@@ -416,7 +416,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         action="append",
         required=True,
         metavar="NAME:KIND:PARENT:CHILD",
-        help=f"a joint between two targets; KIND is {', '.join(JointKind)}",
+        help=f"a joint between two targets; KIND is {', '.join(JointKind)}; once for each joint",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an existing chain.yaml")
 
@@ -426,6 +426,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--overwrite", action="store_true", help="replace an existing OUT")
 
     parser = command("check", check, "Read a setup, and check whether its targets can be distinguished.")
-    parser.add_argument("--noise", type=float, default=3e-4, metavar="METRES", help="of a point (default %(default)s)")
+    parser.add_argument(
+        "--noise",
+        type=float,
+        default=3e-4,
+        metavar="METRES",
+        help="standard deviation of a point (default: %(default)s)",
+    )
 
     load(f"{_RENDER}:add_parser")(commands)

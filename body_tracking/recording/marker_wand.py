@@ -222,7 +222,11 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help="of the balls along the wand, metres from the first: 0,0.15,0.45",
     )
     parser.add_argument(
-        "--deviation", type=float, default=1e-4, metavar="METRES", help="of the wand's length (default: %(default)s)"
+        "--deviation",
+        type=float,
+        default=1e-4,
+        metavar="METRES",
+        help="standard deviation of the wand's length (default: %(default)s)",
     )
     parser.add_argument(
         "--diameter", type=float, default=0.0, metavar="METRES", help="of the balls; 0 takes centroids for centres"

@@ -134,22 +134,26 @@ def _box(pixels: FloatArray, camera: Camera) -> tuple[slice, slice]:
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """``body_tracking mesh``."""
-    command = subparsers.add_parser("mesh", description=__doc__)
+    command = subparsers.add_parser(
+        "mesh", description="The shape of a person from a recording, and pictures of the mesh over depth images."
+    )
     actions = command.add_subparsers(metavar="ACTION", required=True)
     text = "write the shape of a recorded person, for up --person"
     shape = actions.add_parser("personalise", help=text, description=text)
-    shape.add_argument("bag", type=Path, help="recording with depth images")
+    shape.add_argument("bag", type=Path, metavar="BAG", help="recording with depth images")
     shape.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="YAML file to write")
     shape.add_argument("--overwrite", action="store_true", help="replace an existing FILE")
     shape.set_defaults(run=_personalise)
     text = "draw the mesh over depth images"
     show = actions.add_parser("show", help=text, description=text)
-    show.add_argument("bag", type=Path, help="recording with depth images and the mesh")
+    show.add_argument("bag", type=Path, metavar="BAG", help="recording with depth images and the mesh")
     show.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="picture to write")
-    show.add_argument("--images", type=int, default=4, metavar="N", help="evenly spaced over the recording (4)")
+    show.add_argument(
+        "--images", type=int, default=4, metavar="N", help="evenly spaced over the recording (default: 4)"
+    )
     show.set_defaults(run=_show)
     for action in (shape, show):
-        action.add_argument("--depth", default="kinect1", metavar="SENSOR", help="the depth camera (kinect1)")
+        action.add_argument("--depth", default="kinect1", metavar="SENSOR", help="the depth camera (default: kinect1)")
 
 
 def _personalise(args: argparse.Namespace) -> int:
