@@ -22,15 +22,71 @@ from body_tracking.core.skeleton import BONES, N_JOINTS, FloatArray, Joint, Skel
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.angles import angles_to_joint_states, joint_state_values, joint_states_to_angles
 from body_tracking.messages.base import MessageError, MessageTypes
+from body_tracking.messages.cdr import encode_skeletons
+from body_tracking.messages.codecs import Skeletons
 from body_tracking.messages.diagnostics import diagnostics, statuses
 from body_tracking.messages.imus import message_to_magnetic_field, message_to_sample, sample_to_messages
 from body_tracking.messages.model import joint_state_to_segments, segments_to_joint_state
 from body_tracking.messages.node_status import NodeStatus
 from body_tracking.messages.robots import command_to_array, command_to_trajectory
-from body_tracking.recording.rosbag2 import BAG_MESSAGES, deserialize, serialize
+from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, deserialize, serialize
 from body_tracking.viewing.colours import INFERRED, PALETTE
 from body_tracking.viewing.markers import Markers
 from body_tracking.viewing.shapes import ELLIPSOID_RADIUS, ellipsoids, figure, frustum
+
+# --- covariances of joints
+
+UPRIGHT = Skeleton(1, "kinect1_optical_frame", np.ones((N_JOINTS, 3)), np.full(N_JOINTS, 2, dtype=np.uint8))
+POSSIBLE = {
+    "exact": np.zeros((3, 3)),
+    "isotropic": 4e-4 * np.eye(3),
+    "of one direction": 1e-4 * np.ones((3, 3)),
+    "known across its ray": 1e-6 * np.eye(3) + 1e-2 * np.outer([0.6, 0.0, 0.8], [0.6, 0.0, 0.8]),
+    "infinite": np.diag([np.inf] * 3),
+}
+IMPOSSIBLE = {
+    "negative": -1e-4 * np.eye(3),
+    "nan": np.full((3, 3), np.nan),
+    "correlations above 1": 1e-4 * np.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
+    "a negative eigenvalue": 1e-4 * (1.9 * np.eye(3) - 0.9 * np.ones((3, 3))),
+}
+
+
+def with_covariance(of_head: FloatArray) -> tuple[Skeleton, ...]:
+    covariances = np.tile(4e-4 * np.eye(3), (N_JOINTS, 1, 1))
+    covariances[Joint.HEAD] = of_head
+    read = Skeletons().decode(encode_skeletons([replace(UPRIGHT, covariances=covariances)]), BAG_WIRE)
+    assert isinstance(read, tuple)
+    return read
+
+
+@pytest.mark.parametrize("kind", POSSIBLE)
+def test_possible_covariances_are_read(kind: str) -> None:
+    (read,) = with_covariance(POSSIBLE[kind])
+    assert read.covariances is not None
+    np.testing.assert_allclose(read.covariances[Joint.HEAD], POSSIBLE[kind], rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", IMPOSSIBLE)
+def test_an_impossible_covariance_is_refused_by_joint(kind: str) -> None:
+    with pytest.raises(MessageError, match="covariance of HEAD is impossible"):
+        with_covariance(IMPOSSIBLE[kind])
+
+
+def test_covariances_that_are_all_zero_are_unknown() -> None:
+    zero = replace(UPRIGHT, covariances=np.zeros((N_JOINTS, 3, 3)))
+    (read,) = Skeletons().decode(encode_skeletons([zero]), BAG_WIRE)
+    assert read.covariances is None
+
+
+def test_the_covariance_of_a_joint_without_a_position_does_not_matter() -> None:
+    covariances = np.tile(4e-4 * np.eye(3), (N_JOINTS, 1, 1))
+    covariances[Joint.HEAD] = np.nan
+    states = UPRIGHT.states.copy()
+    states[Joint.HEAD] = 0
+    (read,) = Skeletons().decode(encode_skeletons([replace(UPRIGHT, states=states, covariances=covariances)]), BAG_WIRE)
+    assert read.covariances is not None
+
 
 # --- angles, commands, states of nodes
 

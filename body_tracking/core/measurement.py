@@ -220,6 +220,6 @@ def joint_variance(
     if covariances is None:
         return joint_stddev(positions, states, angle) ** 2
     stated = covariances.trace(axis1=1, axis2=2) / 3.0
-    usable = (states > TrackingState.NOT_TRACKED) & np.isfinite(positions).all(axis=1) & (stated > 0.0)
+    usable = (states > TrackingState.NOT_TRACKED) & np.isfinite(positions).all(axis=1) & (stated >= 0.0)
     variance: FloatArray = np.where(usable, np.maximum(stated, BASE_STDDEV**2), np.inf)
     return variance

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from body_tracking.core.skeleton import N_JOINTS, FloatArray, Skeleton, TrackingState
+from body_tracking.core.skeleton import N_JOINTS, BoolArray, FloatArray, Joint, Skeleton, TrackingState
 from body_tracking.messages.base import MessageError, MessageTypes, to_nanoseconds
 from body_tracking.messages.clouds import (
     COVARIANCE,
@@ -28,6 +29,9 @@ _FIELDS = (*POSITION, ("joint", UINT8), ("tracking_state", UINT8), ("body", UINT
 _VELOCITY = tuple((name, FLOAT32) for name in ("vx", "vy", "vz"))
 MAX_BODIES = 64
 """A message with more bodies is malformed."""
+_DIAGONAL = np.arange(3)
+_ROUNDING = 1e-5
+"""Of correlations, whose covariances are float32."""
 
 
 def skeletons_to_cloud(skeletons: Sequence[Skeleton], types: MessageTypes) -> Any:
@@ -87,6 +91,41 @@ def cloud_to_skeletons(cloud: Any) -> tuple[Skeleton, ...]:
         )
         for row in points
     )
+
+
+def check_covariances(skeletons: tuple[Skeleton, ...]) -> tuple[Skeleton, ...]:
+    """The bodies, without covariances where all are zero: in ROS, zero stands for an unknown covariance.
+
+    Raises:
+        MessageError: the covariance of a joint that has a position has a negative variance, NaN, or correlations that
+            are impossible. A variance of zero says that it is exact.
+    """
+    if skeletons[0].covariances is None:
+        return skeletons
+    if not any(np.any(each.covariances) for each in skeletons):
+        return tuple(replace(each, covariances=None) for each in skeletons)
+    for each in skeletons:
+        assert each.covariances is not None
+        wrong = each.valid & ~_possible(each.covariances)
+        if wrong.any():
+            joint = int(wrong.argmax())
+            given = " ".join(f"{value:.3g}" for value in each.covariances[joint][np.triu_indices(3)])
+            raise MessageError(f"covariance of {Joint(joint).name} is impossible (xx xy xz yy yz zz): {given}")
+    return skeletons
+
+
+def _possible(covariances: FloatArray) -> BoolArray:
+    """(n,) whether (n, 3, 3) matrices have no negative variance, and correlations without a negative eigenvalue."""
+    variance = covariances[:, _DIAGONAL, _DIAGONAL]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        scale = np.where((variance > 0.0) & (variance < np.inf), 1.0 / np.sqrt(variance), 1.0)
+        yz, xz, xy = (covariances[:, i, j] * scale[:, i] * scale[:, j] for i, j in ((1, 2), (0, 2), (0, 1)))
+        possible: BoolArray = (
+            (variance >= 0.0).all(axis=1)
+            & (np.maximum(np.maximum(abs(yz), abs(xz)), abs(xy)) <= 1.0 + _ROUNDING)
+            & (1.0 + 2.0 * xy * xz * yz - xy * xy - xz * xz - yz * yz >= -_ROUNDING)
+        )
+    return possible
 
 
 def markers_to_points(message: Any) -> tuple[int, list[int], FloatArray]:

@@ -37,6 +37,7 @@ class OfflineRunner:
 
     Attributes:
         counters: inputs that could not be used, by topic.
+        reasons: by counter, why the first could not.
     """
 
     def __init__(
@@ -47,6 +48,7 @@ class OfflineRunner:
         published: Iterable[str] = (),
     ) -> None:
         self.counters: Counter[str] = Counter()
+        self.reasons: dict[str, str] = {}
         self._stages, self._wire, self._sink = stages, wire, sink
         self._queue: deque[tuple[str, bytes]] = deque()
         self._last_ns: dict[tuple[str, int], int] = {}
@@ -100,8 +102,9 @@ class OfflineRunner:
                 if kind not in decoded:
                     try:
                         decoded[kind] = port.codec.decode(cdr, self._wire)
-                    except BodyTrackingError:
-                        self.counters[f"malformed {topic}"] += not malformed
+                    except BodyTrackingError as error:
+                        if not malformed:
+                            self._count(f"malformed {topic}", error)
                         malformed = True
                         stage.refused(topic)
                         continue
@@ -115,8 +118,12 @@ class OfflineRunner:
     ) -> None:
         try:
             self._publish(number, call(*given), at_ns)
-        except BodyTrackingError:
-            self.counters[f"refused {where}"] += 1
+        except BodyTrackingError as error:
+            self._count(f"refused {where}", error)
+
+    def _count(self, what: str, error: BodyTrackingError) -> None:
+        self.counters[what] += 1
+        self.reasons.setdefault(what, str(error))
 
     def _reset_where_time_jumped(self, number: int, stage: Stage, port: Port, payload: Any) -> None:
         stamp_ns = port.codec.stamp_ns(payload)

@@ -121,7 +121,7 @@ class Downstream:
         written = self._next.finish(at_ns)
         # both may have counted the same message
         counters = Counter(_counters(self._stages.values(), self._runner)) | Counter(written.counters)
-        return Written(written.frames, counters, (*problems_of(self._stages, at_ns), *written.problems))
+        return Written(written.frames, counters, (*problems_of(self._stages, self._runner, at_ns), *written.problems))
 
     @property
     def path(self) -> Path | None:
@@ -165,7 +165,8 @@ class Last:
             self._writer.close()
         else:
             self._writer.discard()
-        return Written(self._frames, _counters(self._stages.values(), self._runner), problems_of(self._stages, at_ns))
+        counters = _counters(self._stages.values(), self._runner)
+        return Written(self._frames, counters, problems_of(self._stages, self._runner, at_ns))
 
     @property
     def path(self) -> Path:
@@ -175,10 +176,11 @@ class Last:
         self._writer.discard()
 
 
-def problems_of(stages: Mapping[str, Stage], at_ns: int) -> tuple[str, ...]:
-    """What is wrong in stages, by node, at a time, in words."""
+def problems_of(stages: Mapping[str, Stage], runner: OfflineRunner, at_ns: int) -> tuple[str, ...]:
+    """What is wrong in stages, by node, at a time, and with their inputs, in words."""
     states = {node: stage.state(at_ns) for node, stage in stages.items()}
-    return tuple(f"{node}: {text}" for node, (level, text, _) in states.items() if level and text)
+    unusable = (f"{what}: {runner.counters[what]}, the first: {why}" for what, why in runner.reasons.items())
+    return (*(f"{node}: {text}" for node, (level, text, _) in states.items() if level and text), *unusable)
 
 
 def _is_last(executable: str) -> bool:

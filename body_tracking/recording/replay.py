@@ -289,7 +289,7 @@ def replay(bag_path: Path, out: Path, settings: ReplaySettings, *, overwrite: bo
         for node, stage in first.items():
             counters.update({f"{node} {name}": count for name, count in stage.counters.items()})
         counters |= Counter(written.counters)  # both halves may have counted the same message
-        problems = [*forked.problems_of(first, bag.end_ns), *written.problems]
+        problems = [*dict.fromkeys((*forked.problems_of(first, runner, bag.end_ns), *written.problems))]
         problems += _left_out(counters)
         if not written.frames:
             given = ", ".join(settings.sensors or sources)

@@ -555,7 +555,7 @@ def test_calibrate_prints_poses_and_clocks(
         ("nothing", "no such"),
         ("empty", "no topic"),
         ("other type", "expected sensor_msgs/msg/PointCloud2"),
-        ("malformed", "no frame"),
+        ("malformed", "malformed /kinect1/skeleton: 1, the first: "),
     ],
 )
 def test_a_bag_without_skeletons_is_named_in_one_line(
