@@ -198,12 +198,20 @@ class PlayedRobots(Robots):
         """Whether every robot is in one of these states, by the last diagnostics."""
         return all(self.robot(robot).get("state") in states for robot in self.arms)
 
+    def report(self) -> str:
+        """What every robot's node said last, for the text of a failure."""
+        lines = []
+        for name in self.arms:
+            node = f"{name}_commands"
+            lines += [f"{node}, exit code {self.processes[node].poll()}: {self.robot(name)}", self.log(node)[-2000:]]
+        return "\n".join(lines)
+
     def kill_while_moving(self) -> float:
         """Kill the sensor while both arms follow and move; returns the wall time."""
         moving = {name: arm.moving for name, arm in self.arms.items()}
-        assert self.until(lambda: self.in_state(State.FOLLOWING) and all(m() for m in moving.values()), 90.0), {
-            name: (self.robot(name), self.log(f"{name}_commands")[-2000:]) for name in self.arms
-        }
+        assert self.until(lambda: self.in_state(State.FOLLOWING) and all(m() for m in moving.values()), 90.0), (
+            self.report()
+        )
         player = self.processes.pop("bag_player")
         killed = time.time()
         player.kill()
@@ -232,7 +240,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
             robots.play()
             killed.append(robots.kill_while_moving())
             followed = len(robots.arms["iiwa7"].commands)
-            assert robots.until(lambda: robots.in_state(State.STOPPED)), robots.diagnostics
+            assert robots.until(lambda: robots.in_state(State.STOPPED)), robots.report()
             for robot in BODIES:
                 reasons[robot].append(robots.robot(robot)[""])
             robots.until(lambda: False, timeout=1.0)  # commands that were on their way
