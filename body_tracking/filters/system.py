@@ -40,8 +40,9 @@ def _specs(options: Options) -> Iterable[NodeSpec]:
     meshes_alone = isinstance(depth, tuple) and isinstance(sensors, tuple) and len(depth) == len(sensors) > 0
     segments = tuple(each.segment for each in worn if not (meshes_alone and each.segment in graph.ARM_SEGMENTS))
     defaults: dict[str, Value] = {"orientations": segments} if segments else {}
-    if options["computed"]:
-        defaults["not_kinects"] = options["computed"]
+    lists = (options["computed"], options["with_covariances"])
+    if others := tuple(dict.fromkeys(each for found in lists if isinstance(found, tuple) for each in found)):
+        defaults["not_kinects"] = others
     defaults |= {f"ekf.{name}": value for name, value in independent_joints(options).items()}
     if options["lag"] and options["filter"] in THESIS_FILTERS:
         raise graph.GraphError(f"filter {options['filter']} cannot smooth (lag)")

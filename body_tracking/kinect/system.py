@@ -142,6 +142,7 @@ SYSTEM = System(
             offline=True,
         ),
         Option("computed", (), hidden=True),
+        Option("with_covariances", (), hidden=True),
         Option("external", False, "start no sensor nodes: other processes publish /<sensor>/skeleton"),
         Option(
             "adapt",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from collections.abc import Mapping, Sequence
 from itertools import chain
@@ -9,12 +10,14 @@ from pathlib import Path
 from typing import Final
 
 import body_tracking
+from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.message_types import COMPRESSED_IMAGE, IMAGE, IMU, POINT_CLOUD
 from body_tracking.core.parameters import Value
 from body_tracking.markers import setup
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.roles import DEFAULT_FILTER, role_of
 from body_tracking.pipeline.system import Option
+from body_tracking.recording.rosbag2 import BagReader, deserialize
 from body_tracking.systems import OPTIONS
 
 SETUPS: Final[Mapping[str, Mapping[str, Value]]] = {
@@ -113,6 +116,18 @@ def unused_imus(options: Mapping[str, Value]) -> str:
 
 def _option(flag: str) -> Option:
     return OPTIONS[flag.removeprefix("--").replace("-", "_")]
+
+
+def with_covariances(bag: BagReader) -> tuple[str, ...]:
+    """The sensors in a recording whose skeletons have covariances: cameras and others, but no Kinect v2."""
+    found = []
+    for sensor in graph.sensors_among(bag.topics):
+        topic = graph.skeleton_topic(sensor)
+        first = next(iter(bag.messages({topic})), None) if bag.topics[topic].type_name == POINT_CLOUD else None
+        with contextlib.suppress(BodyTrackingError):  # a malformed message; who reads them all counts it
+            if first and any(field.name == "xx" for field in deserialize(POINT_CLOUD, first.cdr).fields):
+                found.append(sensor)
+    return tuple(found)
 
 
 def listed(names: Sequence[str], last: str = "and") -> str:

@@ -33,7 +33,7 @@ from body_tracking.pipeline.people import SubjectSelector
 from body_tracking.pipeline.roles import NOTABLE_LATE, ROLES
 from body_tracking.pipeline.system import Options
 from body_tracking.recording import forked
-from body_tracking.recording.finding import advice_for, unused, unused_imus
+from body_tracking.recording.finding import advice_for, unused, unused_imus, with_covariances
 from body_tracking.recording.progress import Progress
 from body_tracking.recording.rig import RigReader
 from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader, check_new_bag, deserialize
@@ -355,7 +355,9 @@ _NAMED: Final = ("sensors", "filter", "convention", "calibration", "imus", "para
 
 def settings_from(args: argparse.Namespace) -> ReplaySettings:
     """The settings of a command line."""
-    options: dict[str, Any] = {**with_file(options_of(**{**options_from(args), "external": True}), args.params_file)}
+    with BagReader(args.bag) as bag:
+        given = {**options_from(args), "external": True, "with_covariances": with_covariances(bag)}
+    options: dict[str, Any] = {**with_file(options_of(**given), args.params_file)}
     specs = stage_hosts(nodes_for(options))
     left = ("use_sim_time", "sensors", "calibration_file", *OFFLINE)
     parameters = {
@@ -448,6 +450,6 @@ def run(args: argparse.Namespace) -> int:
     if args.verbose:
         print(f"left out or noted on the way: {_listed(report.counters)}")
     elif report.counters:
-        print(f"-v prints {len(report.counters)} counters of what was used, left out or noted")
+        print(f"replay -v prints {len(report.counters)} counters of what was used, left out or noted")
     print(f"written to {args.output}")
     return 0

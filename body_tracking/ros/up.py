@@ -37,7 +37,7 @@ from body_tracking.node_parameters import parameters_for
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.shared import names_in
 from body_tracking.pipeline.system import NodeSpec, Options
-from body_tracking.recording.finding import advice_for, unused, unused_imus
+from body_tracking.recording.finding import advice_for, unused, unused_imus, with_covariances
 from body_tracking.recording.rig import RigReader
 from body_tracking.robot.system import convention_of
 from body_tracking.ros import dds
@@ -141,6 +141,7 @@ def options_for(args: argparse.Namespace, found: Mapping[str, Value] = MappingPr
             topics = frozenset(reader.topics)
             types = {name: each.type_name for name, each in reader.topics.items()}
             there = graph.sensors_among(reader.topics)
+            given["with_covariances"] = with_covariances(reader)
             duration = (reader.end_ns - reader.start_ns) / NANOSECONDS
         if args.start and not 0.0 < args.start < duration:
             raise UpError(f"start {args.start:g}: the bag lasts {duration:.1f} s")

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import argparse
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from body_tracking.core.message_types import COMPRESSED_IMAGE, IMAGE, IMU, JOINT_STATE, POINT_CLOUD
+from body_tracking.core.skeleton import Joint, Skeleton, TrackingState
+from body_tracking.messages.codecs import Skeletons
+from body_tracking.recording import replay
 from body_tracking.recording.finding import advice_for, unused, unused_imus
+from body_tracking.recording.rosbag2 import BAG_WIRE, BagWriter
 from body_tracking.systems import options_of
 
 FIVE = {
@@ -82,3 +89,19 @@ def test_a_recording_of_marker_points_says_which_option_to_add() -> None:
     for more in ({}, {"/left/image_raw": IMAGE}):
         advice = advice_for({**MARKERS, **more}, "body_tracking view")
         assert advice.startswith("add to body_tracking view the option that takes them: --marker-setup FOLDER (")
+
+
+def test_cameras_whose_skeletons_a_recording_has_are_not_corrected_as_kinects(tmp_path: Path) -> None:
+    """A session of ``up --camera`` or ``--depth`` may be replayed with another filter."""
+    points, states = np.zeros((len(Joint), 3)), np.full(len(Joint), TrackingState.TRACKED)
+    covariances = np.broadcast_to(1e-4 * np.eye(3), (len(Joint), 3, 3))
+    with BagWriter(tmp_path / "session") as writer:
+        for sensor, stated in (("camera1", covariances), ("kinect1", None), ("silent", None)):
+            writer.add_topic(f"/{sensor}/skeleton", POINT_CLOUD)
+            seen = Skeleton(1, f"{sensor}_optical_frame", points, states, covariances=stated)
+            if sensor != "silent":
+                writer.write(f"/{sensor}/skeleton", Skeletons().encode((seen,), BAG_WIRE), 1)
+    parser = argparse.ArgumentParser()
+    replay.add_parser(parser.add_subparsers())
+    settings = replay.settings_from(parser.parse_args(["replay", str(tmp_path / "session"), "-o", "out"]))
+    assert settings.parameters["skeleton_filter"]["not_kinects"] == ("camera1",)
