@@ -14,10 +14,11 @@ from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.message_types import COMPRESSED_IMAGE, IMAGE, IMU, POINT_CLOUD
 from body_tracking.core.parameters import Value
 from body_tracking.markers import setup
+from body_tracking.messages.codecs import Skeletons
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.roles import DEFAULT_FILTER, role_of
 from body_tracking.pipeline.system import Option
-from body_tracking.recording.rosbag2 import BagReader, deserialize
+from body_tracking.recording.rosbag2 import BAG_WIRE, BagReader
 from body_tracking.systems import OPTIONS
 
 SETUPS: Final[Mapping[str, Mapping[str, Value]]] = {
@@ -125,7 +126,7 @@ def with_covariances(bag: BagReader) -> tuple[str, ...]:
         topic = graph.skeleton_topic(sensor)
         first = next(iter(bag.messages({topic})), None) if bag.topics[topic].type_name == POINT_CLOUD else None
         with contextlib.suppress(BodyTrackingError):  # a malformed message; who reads them all counts it
-            if first and any(field.name == "xx" for field in deserialize(POINT_CLOUD, first.cdr).fields):
+            if first and Skeletons().decode(first.cdr, BAG_WIRE)[0].covariances is not None:
                 found.append(sensor)
     return tuple(found)
 

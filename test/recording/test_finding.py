@@ -96,7 +96,12 @@ def test_cameras_whose_skeletons_a_recording_has_are_not_corrected_as_kinects(tm
     points, states = np.zeros((len(Joint), 3)), np.full(len(Joint), TrackingState.TRACKED)
     covariances = np.broadcast_to(1e-4 * np.eye(3), (len(Joint), 3, 3))
     with BagWriter(tmp_path / "session") as writer:
-        for sensor, stated in (("camera1", covariances), ("kinect1", None), ("silent", None)):
+        for sensor, stated in (
+            ("camera1", covariances),
+            ("kinect1", None),
+            ("kinect2", 0.0 * covariances),
+            ("silent", None),
+        ):
             writer.add_topic(f"/{sensor}/skeleton", POINT_CLOUD)
             seen = Skeleton(1, f"{sensor}_optical_frame", points, states, covariances=stated)
             if sensor != "silent":
