@@ -48,7 +48,7 @@ def prepare() -> None:
     """
     domain(os.environ)
     if not any(os.environ.get(name) for name in PROFILES):
-        _use(_RESEND)
+        os.environ.update(dict.fromkeys(PROFILES, str(_RESEND)))
 
 
 def stay_on_this_machine() -> None:
@@ -67,15 +67,14 @@ def stay_on_this_machine() -> None:
     fast_dds = os.environ.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp") == "rmw_fastrtps_cpp"
     if chosen != "LOCALHOST" or not fast_dds or any(name in os.environ for name in others):
         return
-    os.environ[_RANGE] = "SUBNET"  # of the loopback interface
-    _use(_LOOPBACK)
+    os.environ.update(loopback())
+
+
+def loopback() -> dict[str, str]:
+    """The variables by which Fast DDS uses the loopback interface alone, and no shared memory."""
+    return {_RANGE: "SUBNET", **dict.fromkeys(PROFILES, str(_LOOPBACK))}
 
 
 def is_local() -> bool:
     """Whether this process discovers nodes of this machine only."""
     return os.environ.get(_RANGE) == "LOCALHOST" or os.environ.get(PROFILES[0]) == str(_LOOPBACK)
-
-
-def _use(file: Path) -> None:
-    for name in PROFILES:
-        os.environ[name] = str(file)

@@ -42,6 +42,7 @@ from body_tracking.pipeline import graph  # noqa: E402
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BagReader, BagWriter, deserialize  # noqa: E402
 from body_tracking.robot.follower import State  # noqa: E402
 from body_tracking.robot.mapping import RobotMapping, load  # noqa: E402
+from body_tracking.ros import dds  # noqa: E402
 from body_tracking.ros.wire import ROS  # noqa: E402
 
 SENSOR = graph.skeleton_topic("kinect1")
@@ -158,6 +159,7 @@ class PlayedRobots(Robots):
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder, *BODIES)
+        self.environment |= dds.loopback()  # as ``up`` does: a node killed while it writes locks no shared memory
         self.bag = folder / "angles"
         write_angles(self.bag, 12.0)  # in a loop; both arms move after half of it
         self.start("calibration", sensors="[kinect1]", use_sim_time=True)
