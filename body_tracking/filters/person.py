@@ -249,16 +249,13 @@ class PersonFilter:
         for sensor, skeleton in frames:
             if not self._model_filter.take(skeleton, sensor):
                 continue
-            if self._lag is None:
-                self._prediction.arrived(skeleton.stamp_ns, now_ns)
-                if self._counts_later(skeleton.stamp_ns):
-                    continue  # before its estimate is computed, which takes as long as the frame
             estimate = self._model_filter.estimate
             assert estimate is not None  # a frame was taken
             if self._lag is not None:
                 self._prediction.stop()
                 self._hold_back(self._lag, None, now_ns)
             else:
+                self._prediction.arrived(skeleton.stamp_ns, now_ns)
                 self._send(None, estimate)
             if self._lengths.due(estimate.stamp_ns, estimate.lengths):
                 from body_tracking.kinematics.urdf import urdf
@@ -266,23 +263,19 @@ class PersonFilter:
                 text = urdf(self._model_filter.model, estimate.lengths, self._body)
                 self._publish(self._topics.urdf, text, estimate.stamp_ns)
 
-    def _counts_later(self, stamp_ns: int) -> bool:
-        """Whether a frame counts in the next estimate, since one of its time or a later one is published.
-
-        Stamps increase, as receivers of transforms need it.
-        """
-        last_ns = self._published_ns
-        later = last_ns is not None and stamp_ns <= last_ns and not jumped_back(stamp_ns, last_ns)
-        self._overtaken += later
-        return later
-
     def _publish_skeleton(self, skeleton: Skeleton) -> None:
         self._publish(graph.FILTERED, (skeleton,), skeleton.stamp_ns)
 
     def _send(self, skeleton: Skeleton | None, estimate: ModelEstimate) -> None:
-        """Publish an estimate and its skeleton; None for the filter's current one."""
+        """Publish an estimate and its skeleton; None for the filter's current one.
+
+        Stamps increase, as receivers of transforms need it: a frame that comes after an estimate of its time, or after
+        a prediction of a later one, counts in the next estimate.
+        """
         assert self._model_filter is not None
-        if self._counts_later(estimate.stamp_ns):
+        last_ns = self._published_ns
+        if last_ns is not None and estimate.stamp_ns <= last_ns and not jumped_back(estimate.stamp_ns, last_ns):
+            self._overtaken += 1
             return
         self._published_ns = estimate.stamp_ns
         if self._wanted(graph.FILTERED):
