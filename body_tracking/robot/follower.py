@@ -272,12 +272,15 @@ class Follower:
             steady_ns: now.
 
         Raises:
-            FollowerError: a joint is missing or its position is not finite.
+            FollowerError: a joint is missing or there twice, or its position is not finite.
         """
         self._robot, self._robot_ns, self._robot_state_fault = None, steady_ns, ""
         missing = [name for name in self.mapping.joints if name not in joints]
+        twice = [name for name in self.mapping.joints if joints.count(name) > 1]
         if missing:
             self._robot_state_fault = f"the robot's joint states: {missing[0]} is not among them"
+        elif twice:
+            self._robot_state_fault = f"the robot's joint states: {twice[0]} is there twice"
         elif len(position) != len(joints):
             self._robot_state_fault = f"the robot's joint states: {len(position)} positions of {len(joints)} joints"
         elif not np.isfinite(found := position[[joints.index(name) for name in self.mapping.joints]]).all():
@@ -359,7 +362,8 @@ class Follower:
             # An upper bound over all correlations of angle and velocity, which the message does not carry. Beyond the
             # horizon of the prediction the velocity itself is the error.
             stddev = angles.position_stddev + wait * angles.velocity_stddev + (wait - ahead) * np.abs(angles.velocity)
-            stddev[~((angles.position_stddev >= 0.0) & (angles.velocity_stddev >= 0.0))] = np.nan
+            # 0 is no standard deviation of an estimate: its publisher does not know it
+            stddev[~((angles.position_stddev > 0.0) & (angles.velocity_stddev > 0.0))] = np.nan
             sound = possible & np.isfinite(stddev)
         most = np.where(self._used, mapping.max_stddev[:, None], np.inf)
         known = (~self._used | (sound & (stddev <= most))).all(axis=1)

@@ -199,7 +199,9 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "uncertain": ({"stddev": [0.5, 0.1, 0.1]}, "standard deviation of shoulder_elevation_left is 0.5"),
     "negative deviation": ({"stddev": [-0.1, 0.1, 0.1]}, NOT_SURE),
     "no deviation": ({"stddev": [0.1, 0.1, math.nan]}, "standard deviation of elbow_flexion_left is nan rad"),
+    "a deviation of zero": ({"stddev": [0.0, 0.1, 0.1]}, NOT_SURE),
     "negative deviation of the rate": ({"velocity_stddev": -0.2}, NOT_SURE),
+    "a deviation of zero of the rate": ({"velocity_stddev": 0.0}, NOT_SURE),
     "no deviation of the rate": ({"velocity_stddev": math.nan}, NOT_SURE),
     "a rate that no body has": ({"velocity": [0.0, 0.0, -60.0]}, "elbow_flexion_left is 0.8 rad at -60 rad/s"),
     "an angle that no body has": ({"pose": [1e300, 0.0, 0.0]}, "shoulder_elevation_left is 1e+300 rad"),
@@ -409,6 +411,7 @@ def test_it_begins_where_the_robot_stands() -> None:
     ("joints", "position", "reported"),
     [
         (("shoulder",), [0.0], "elbow is not among them"),
+        (("shoulder", "elbow", "elbow"), [0.0, 0.0, 1.0], "elbow is there twice"),
         (("shoulder", "elbow"), [0.0], "1 positions of 2 joints"),
         (("shoulder", "elbow"), [0.0, math.nan], "not finite"),
     ],
