@@ -73,6 +73,7 @@ _NAMELESS = "_NODE_NAME_UNKNOWN_"
 _FAILURES = 10
 """Consecutive failed callbacks of one input after which the node resets its state."""
 _STATE_LEVELS = ("OK", "warning", "error", "stale")
+_SIMULATED = Parameter("use_sim_time", False, "whether the node's time is /clock")
 
 
 class Alarm:
@@ -199,7 +200,7 @@ class GraphNode(BatchNode):
 
     def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
         """Called by the parameter services; a refusal states our reason, not rcl's."""
-        table = {parameter.name: parameter for parameter in self.PARAMETERS}
+        table = {parameter.name: parameter for parameter in (*self.PARAMETERS, _SIMULATED)}
         changes = []
         for change in parameter_list:
             try:

@@ -138,6 +138,15 @@ def test_wrong_name_or_value_is_refused_with_our_reason(running: Graph) -> None:
     assert running.get("fusion", ["silence", "method", "max_wait"]) == before
 
 
+@pytest.mark.parametrize("node", ["fusion", "bag_recorder"])
+def test_the_clock_of_a_running_node_cannot_change(running: Graph, node: str) -> None:
+    for value in (True, False):
+        [(done, reason)] = running.set(node, use_sim_time=value)
+        assert not done
+        assert reason.startswith(f"{node}: parameter 'use_sim_time' cannot change while the node runs")
+    assert not running.get(node, ["use_sim_time"])[0].bool_value
+
+
 def test_integer_is_accepted_for_a_float(running: Graph) -> None:
     assert running.set("fusion", max_wait=1) == [(True, "")]
     [wait] = running.get("fusion", ["max_wait"])
