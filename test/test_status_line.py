@@ -78,6 +78,15 @@ def test_messages_that_a_node_did_not_process_are_reported_where_they_are_many()
     assert losses_part({"robot_commands": status(received=20, **{"dropped /joint_states": 2})}) == []  # at the start
 
 
+def test_a_message_without_results_counts_once_whatever_the_number_of_outputs() -> None:
+    outputs = ("/filtered/skeleton", "/filtered/model_state", "/humans/bodies/body1/segments")
+    values = {"received": "100", "left out after a standstill /kinect1/skeleton": "20"}
+    for topic in outputs:
+        values |= {f"subscribers {topic}": "1", f"left out after a standstill {topic}": "30"}
+    (part,) = losses_part({"skeleton_filter": NodeStatus("", 0, "", values)})
+    assert part.endswith("skeleton_filter 50")
+
+
 def test_a_reliable_graph_names_every_lost_message_and_another_one_names_the_option() -> None:
     found = {"kinect1_mesh": NodeStatus("", 0, "", {"received": "299", "lost /kinect1/depth/image_raw": "2"})}
     text = "messages not processed (machine or network too slow): kinect1_mesh 2"
@@ -268,3 +277,14 @@ def test_a_recording_that_the_page_began_is_named_at_the_end() -> None:
     assert monitor.summary(options, 3.0, {}) == "ran for 3.0 s: 7 frames of joint angles, recorded in session_2"
     monitor._statuses = {"bag_recorder": NodeStatus("", 0, "stopped", {"messages": "0", "bag": "None"})}
     assert monitor.summary(options, 3.0, {}) == "ran for 3.0 s: 7 frames of joint angles"
+
+
+def test_a_recording_that_stopped_is_named_at_once_and_at_the_end() -> None:
+    monitor = monitor_without_node()
+    monitor.angles = 7
+    values = {"messages": "120", "bag": "session", "lost": "31"}
+    full = NodeStatus("bag_recorder: bag", 2, "session_0.mcap: No space left on device", values, time.monotonic())
+    monitor._statuses = {"bag_recorder": full}
+    options = options_of(sensors=("kinect1",), external=True)
+    assert "| bag_recorder: session_0.mcap: No space left on device" in monitor.line(options, 5.0, {})
+    assert monitor.summary(options, 9.0, {}).endswith(", recorded in session (31 messages or more are missing)")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -50,11 +51,11 @@ NODES = ("joint_angles", "skeleton_filter", "fusion", "calibration", "bag_record
 class Up:
     """A running ``body_tracking up``, and a subscriber of its angles."""
 
-    def __init__(self, folder: Path, *arguments: str | Path) -> None:
+    def __init__(self, folder: Path, *arguments: str | Path, output: Path | None = None) -> None:
         number = domain()
         self.environment = {**os.environ, "ROS_DOMAIN_ID": str(number)}
         self.environment.pop("ROS_AUTOMATIC_DISCOVERY_RANGE", None)  # up stays on this machine by itself
-        self.output = folder / "up.log"
+        self.output = output or folder / "up.log"
         self.command = [sys.executable, "-m", "body_tracking.cli", "up", "--log-dir", folder, *arguments]
         self.start()
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
@@ -105,8 +106,8 @@ class Up:
 def up(tmp_path: Path) -> Iterator[Callable[..., Up]]:
     started: list[Up] = []
 
-    def start(*arguments: str | Path) -> Up:
-        started.append(Up(tmp_path, *arguments))
+    def start(*arguments: str | Path, output: Path | None = None) -> Up:
+        started.append(Up(tmp_path, *arguments, output=output))
         return started[-1]
 
     yield start
@@ -267,6 +268,23 @@ def refusal(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1
     return lines[0]
+
+
+@pytest.mark.slow
+def test_a_full_disk_and_lost_logs_end_no_graph(up: Callable[..., Up], tmp_path: Path) -> None:
+    logs = tmp_path / "logs"
+    graph_up = up("--bag", BAG, "--loop", "--log-dir", logs, output=Path("/dev/full"))
+    assert graph_up.until(lambda: len(graph_up.received) > 30, timeout=120.0)
+    shutil.rmtree(logs)
+    logs.touch()  # no file can be written below it
+    graph_up.nodes()["fusion"].kill()
+    graph_up.until(lambda: False, timeout=2.0)
+    assert graph_up.process.poll() is None and "fusion" not in graph_up.nodes()
+    logs.unlink()
+    assert graph_up.until(lambda: "fusion" in graph_up.nodes(), timeout=20.0)
+    received = len(graph_up.received)
+    assert graph_up.until(lambda: len(graph_up.received) > received + 30, timeout=30.0 * contention())
+    end(graph_up, signal.SIGINT)
 
 
 def test_a_graph_that_cannot_start_leaves_no_recording(up: Callable[..., Up], tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ Over 500 lines: reader, writer and metadata of one format, which must agree.
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import os
 import re
@@ -535,6 +536,8 @@ class BagWriter:
         with self._writing():
             self._mcap.flush()  # type: ignore[no-untyped-call]
             os.fdatasync(self._sink.file.fileno())
+            if not os.fstat(self._sink.file.fileno()).st_nlink:
+                raise FileNotFoundError(errno.ENOENT, "the file was deleted")
         self._flushed_s = time.monotonic()
 
     def close(self) -> None:

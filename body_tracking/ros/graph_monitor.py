@@ -96,9 +96,15 @@ def losses_part(
 
 
 def _losses(status: NodeStatus) -> tuple[float, float]:
-    """Numbers of messages that a node did not process, and that it received."""
-    lost = sum(status.number(key) or 0.0 for key in status.values if key.startswith(_LOSSES))
-    return lost, status.number("received") or 0.0
+    """Numbers of messages that a node did not process, and that it received.
+
+    A message whose results were not published, because a standstill made them old, counts once, whatever the number of
+    the node's outputs.
+    """
+    lost = {key: status.number(key) or 0.0 for key in status.values if key.startswith(_LOSSES)}
+    outputs = {key for key in lost if f"subscribers {key.rpartition(' ')[2]}" in status.values}
+    inputs = sum(number for key, number in lost.items() if key not in outputs)
+    return inputs + max((lost[key] for key in outputs), default=0.0), status.number("received") or 0.0
 
 
 def _malformed(statuses: Mapping[str, NodeStatus]) -> tuple[int, str]:
@@ -242,6 +248,8 @@ class GraphMonitor:
             # all wait for the bag, and joint_angles for a filter that may not have started
             waiting = (*fresh,) if starts else ("joint_angles",) * (elapsed < _SILENT_S)
             parts += problem_parts(fresh, waiting)
+        elif "bag_recorder" in fresh and fresh["bag_recorder"].level == 2:
+            parts.append(f"bag_recorder: {fresh['bag_recorder'].text}")
         malformed, _ = _malformed(fresh)
         if malformed:
             parts.append(f"malformed {malformed}")
@@ -344,6 +352,8 @@ class GraphMonitor:
                 text += f" to {last}"
         elif last:
             text += f", recorded in {last}"  # by the page or the service
+        if recorder is not None and (lost := recorder.number("lost")):
+            text += f" ({lost:.0f} messages or more are missing)"
         reliable = bool(options.get("reliable"))
         losses = losses_part(self._statuses, reliable=reliable)
         text += "".join(f"; {part}" for part in losses)

@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from types import FrameType, MappingProxyType
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, NoReturn, TextIO
 
 import yaml
 
@@ -254,7 +254,7 @@ class Console:
         """Print a line above the status line."""
         with self._lock:
             self._erase()
-            print(text, file=sys.stderr if error else sys.stdout, flush=True)
+            self._print(f"{text}\n", sys.stderr if error else sys.stdout)
             self._draw()
 
     def status(self, text: str) -> None:
@@ -266,26 +266,36 @@ class Console:
                 self._draw()
             elif time.monotonic() - self._last >= LINE_PERIOD:
                 self._last = time.monotonic()
-                print(text, flush=True)
+                self._print(f"{text}\n")
 
     def end(self) -> None:
         """Leave the status line as the last one."""
         with self._lock:
             if self._terminal and self._status:
-                print(flush=True)
+                self._print("\n")
             self._status, self._drawn = "", 0
 
     def _draw(self) -> None:
         if self._terminal and self._status:
             lines = textwrap.wrap(self._status, shutil.get_terminal_size().columns - 1, subsequent_indent=" " * 9)
-            print("\n".join(lines), end="", flush=True)
+            self._print("\n".join(lines))
             self._drawn = len(lines)
 
     def _erase(self) -> None:
         if self._drawn:
             up = f"\x1b[{self._drawn - 1}A" if self._drawn > 1 else ""
-            print(f"\r{up}\x1b[J", end="", flush=True)
+            self._print(f"\r{up}\x1b[J")
             self._drawn = 0
+
+    @staticmethod
+    def _print(text: str, stream: TextIO | None = None) -> None:
+        """Print; a full disk does not end the graph, but a pipe without a reader does."""
+        try:
+            print(text, end="", file=stream, flush=True)
+        except BrokenPipeError:
+            raise
+        except OSError:
+            pass
 
 
 class Supervisor:
@@ -400,7 +410,16 @@ class Supervisor:
         spec = child.spec
         file = self.folder / f"{spec.name}.parameters.yaml"
         values = {name: to_ros(value) for name, value in child.parameters.items()}
-        file.write_text(yaml.safe_dump({spec.full_name: {SECTION: values}}), encoding="utf-8")
+        text = yaml.safe_dump({spec.full_name: {SECTION: values}})
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)  # somebody may have cleared the logs
+            # a full disk would make an unchanged file an empty one
+            if not file.exists() or file.read_text(encoding="utf-8") != text:
+                file.write_text(text, encoding="utf-8")
+        except OSError as error:
+            self.console.line(f"{spec.name} cannot be started: {file}: {error.strerror}; trying again", error=True)
+            child.due = time.monotonic() + BACKOFFS[-1]
+            return
         command = [sys.executable, "-m", "body_tracking.nodes", spec.executable, "--ros-args"]
         command += ["-r", f"__node:={spec.name}", "-r", f"__ns:={spec.namespace}", "--params-file", str(file)]
         for source, target in spec.remappings:
@@ -451,10 +470,12 @@ class Supervisor:
     def _read(self, child: Child, process: subprocess.Popen[bytes]) -> None:
         """Write a node's output to its log, and warnings and errors to the console."""
         assert process.stdout is not None
-        with (self.folder / f"{child.spec.name}.log").open("a", encoding="utf-8") as log, process.stdout:
+        file = self.folder / f"{child.spec.name}.log"
+        with process.stdout:
             for raw in process.stdout:
                 text = raw.decode("utf-8", "replace").rstrip()
-                print(text, file=log, flush=True)
+                with contextlib.suppress(OSError), file.open("a", encoding="utf-8") as log:  # the disk may be full
+                    print(text, file=log)
                 level = _ROS_LOG.match(text)
                 if not text or (level is not None and level[1] in ("DEBUG", "INFO")) or _FAST_DDS.search(text):
                     continue

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import shutil
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -430,3 +431,16 @@ def test_full_disk_is_reported_without_a_crash(bench, tmp_path):
     bench.finished(recorder, signal.SIGINT)
     with BagReader(folder) as reader:
         assert len(list(reader.messages())) > 20
+
+
+def test_a_recording_that_is_deleted_meanwhile_is_reported_and_can_begin_again(bench, tmp_path):
+    bench.publish(50.0, lambda: "hello", "/talk")
+    folder = tmp_path / "bag"
+    bench.start("bag_recorder", folder=folder, topics=["/talk"], chunk_seconds=0.05)
+    bench.wait_until(lambda: bench.number("bag_recorder", "messages") > 5, "messages are recorded")
+    shutil.rmtree(folder)
+    text = f"{folder / 'bag_0.mcap'}: the file was deleted"
+    bench.wait_until(lambda: bench.said("bag_recorder").get("") == text, "an error in the diagnostics")
+    bench.wait_until(lambda: bench.number("bag_recorder", "lost") > 5, "a count of what is lost")
+    assert bench.call(Trigger, "/recorder/start", Trigger.Request()).success
+    bench.wait_until(lambda: len(read_so_far(folder)) > 5, "the recording goes on")
