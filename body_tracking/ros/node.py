@@ -445,7 +445,7 @@ class GraphNode(BatchNode):
         taken = [(self._droppable[messages[place][0]], messages[place][1][1]) for place in frames]
         arrived = [(topic, info["received_timestamp"]) for topic, info in taken]
         late = {frames[each] for each in self.backlog.late(arrived, time.time_ns())}
-        for place in late:
+        for place in sorted(late):  # a number that is not in order would count as another publisher's
             subscription, (_, info) = messages[place]
             self.sequences.note(self._droppable[subscription], info["publication_sequence_number"])
         return [each for place, each in enumerate(messages) if place not in late] if late else messages

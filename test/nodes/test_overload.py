@@ -52,6 +52,22 @@ def slow(monkeypatch: pytest.MonkeyPatch) -> Iterator[Slow]:
     rclpy.try_shutdown()
 
 
+def test_dropped_frames_are_not_taken_for_lost_ones(slow: Slow) -> None:
+    """Whatever their places in a batch, they count in the order of their numbers."""
+    subscription = next(iter(slow._droppable))
+    topic = slow._droppable[subscription]
+    old_ns = time.time_ns() - 10**9
+    slow.backlog._above_since_ns = 0  # the frames have come too late for long
+    frames = [
+        (subscription, (b"", {"publication_sequence_number": 1 + number, "received_timestamp": old_ns + number}))
+        for number in range(90)
+    ]
+    assert slow.drop_late([(None, None)] * 5 + frames) == [(None, None)] * 5 + frames[-1:]
+    slow.sequences.note(topic, 90)
+    assert slow.backlog.dropped[topic] == 89
+    assert not slow.sequences.lost[topic] and not slow.sequences.switched[topic]
+
+
 @pytest.mark.alone
 def test_slow_node_drops_old_frames_and_reports_them(slow: Slow) -> None:
     reports: list[Any] = []
