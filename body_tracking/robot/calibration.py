@@ -41,10 +41,12 @@ class CalibrationQuality:
 
 
 def _number(text: str) -> float:
+    """The standard deviation; NaN for a text that is none."""
     try:
-        return float(text)
+        number = float(text)
     except ValueError:
         return math.nan
+    return number if number >= 0.0 else math.nan
 
 
 class CalibrationWatch:

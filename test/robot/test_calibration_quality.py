@@ -47,8 +47,9 @@ def test_the_least_certain_sensor_counts() -> None:
     assert quality.translation_stddev == pytest.approx(0.1, abs=1e-3)
 
 
-def test_values_that_are_no_number_are_nan() -> None:
-    values = {"reference": "a", "b rotation_stddev_deg": "much", "b translation_stddev_mm": "3"}
+@pytest.mark.parametrize("text", ["much", "-5.0"])
+def test_values_that_are_no_standard_deviation_are_nan(text: str) -> None:
+    values = {"reference": "a", "b rotation_stddev_deg": text, "b translation_stddev_mm": "3"}
     quality = CalibrationQuality.from_diagnostics(values, ("a", "b"))
     assert math.isnan(quality.rotation_stddev)
     assert quality.translation_stddev == pytest.approx(0.003)
