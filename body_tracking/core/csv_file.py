@@ -76,6 +76,15 @@ class CsvFile:
             raise self.error(first, "a quoted cell goes on over several lines")
         return rows
 
+    def check_separator(self, header: list[str]) -> None:
+        """Reject a header of one cell that holds another separator than the comma.
+
+        Raises:
+            CsvError: the cells are separated by semicolons or tabs.
+        """
+        if len(header) == 1 and (separator := next((each for each in ";\t" if each in header[0]), None)):
+            raise self.error(1, f"cells are separated by {separator!r}, expected ','")
+
     def time_ns(self, line: int, text: str, name: str) -> int:
         """Seconds as text to nanoseconds, exactly: a double would round stamps since 1970."""
         try:

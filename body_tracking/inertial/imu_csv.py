@@ -87,7 +87,7 @@ def is_imu_csv(path: Path) -> bool:
     Raises:
         CsvError: the file cannot be read.
     """
-    names = [name.strip() for name in re.split("[;,]", next(CsvFile(path).lines(), ""))]
+    names = [name.strip() for name in re.split("[;,\t]", next(CsvFile(path).lines(), ""))]
     return (
         names[: len(_REPO_HEADER)] == _REPO_HEADER
         or any(_LPMS.fullmatch(name) for name in names)
@@ -173,6 +173,7 @@ class ImuCsvRecording:
         names = [name.strip() for name in names]
         if names[: len(_REPO_HEADER)] == _REPO_HEADER:
             return self._repo_layout(names)
+        self._file.check_separator(names)
         twice = [name for name, count in Counter(names).items() if count > 1]
         if twice:
             raise self._file.error(1, f"column {twice[0]!r} is there twice")

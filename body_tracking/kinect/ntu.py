@@ -21,8 +21,16 @@ import numpy as np
 
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.files import open_regular
-from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, Skeleton, TrackingState
-from body_tracking.core.sources import NOT_FINITE, RecordedFrame, check_sensor_name, optical_frame
+from body_tracking.core.skeleton import (
+    MAX_RANGE,
+    N_JOINTS,
+    NANOSECONDS,
+    BoolArray,
+    FloatArray,
+    Skeleton,
+    TrackingState,
+)
+from body_tracking.core.sources import FAR, NOT_FINITE, RecordedFrame, check_sensor_name, optical_frame
 from body_tracking.kinect.axes import camera_space_to_optical
 
 FRAME_RATE = 30
@@ -152,6 +160,7 @@ class NtuRecording:
         lost: BoolArray = np.asarray(~np.isfinite(joints[:, :3]).all(axis=1))
         counts[NOT_FINITE] += int(lost.sum())
         positions = camera_space_to_optical(np.where(lost[:, None], np.nan, joints[:, :3]))
+        counts[FAR] += int((np.abs(positions) >= MAX_RANGE).any(axis=1).sum())
         states = np.where(lost, TrackingState.NOT_TRACKED, joints[:, _STATE]).astype(np.uint8)
         return Skeleton(stamp_ns, optical_frame(self.sensor), positions, states, number)
 

@@ -276,8 +276,18 @@ def import_files(
         dict(sorted(found.items())),
         (end_ns - start_ns) / NANOSECONDS,
         dict(sum((Counter(recording.problems) for recording in recordings), Counter())),
-        [warning for recording in recordings for warning in recording.warnings],
+        [warning for recording in recordings for warning in recording.warnings] + _too_slow(found),
     )
+
+
+def _too_slow(sensors: Mapping[str, ImportedSensor]) -> list[str]:
+    """A warning for each sensor whose mean interval between messages is over a second, as of stamps in milliseconds."""
+    intervals = {name: each.seconds / (each.frames - 1) for name, each in sensors.items() if each.frames > 1}
+    return [
+        f"{name}: {interval:.3g} s from one message to the next, in the mean: are its times in seconds?"
+        for name, interval in sorted(intervals.items())
+        if interval > 1.0
+    ]
 
 
 def _names(files: Sequence[Path], given: Mapping[Path, str]) -> list[str | None]:

@@ -71,6 +71,8 @@ def test_readings_that_cannot_be_and_stamps_that_repeat_are_counted_and_the_firs
         (OWN + ROW.replace("wrist", "left wrist"), "line 2: sensor name 'left wrist'"),
         (OWN.replace("orientation_w", "w") + ROW, "line 1: missing column orientation_w"),
         (OWN.replace("stamp", "time") + ROW, "line 1: missing column stamp"),
+        ((OWN + ROW).replace(",", ";"), "line 1: cells are separated by ';', expected ','"),
+        ((OWN + ROW).replace(",", "\t"), r"line 1: cells are separated by '\\t', expected ','"),
         (OWN.replace("battery", "stamp") + ROW, "line 1: column 'stamp' is there twice"),
         ("IMU_TIMESTAMP(0)_0,IMU_GYROSCOPE(0)_0\n1,2\n", r"missing column IMU_GYROSCOPE\(0\)_1"),
         ("stamp\n1\n", "no column of orientation_x"),

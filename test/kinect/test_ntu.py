@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from body_tracking.core.skeleton import TrackingState
-from body_tracking.core.sources import NOT_FINITE
+from body_tracking.core.sources import FAR, NOT_FINITE
 from body_tracking.kinect.ntu import EMPTY, NtuError, NtuRecording, sensor_of
 from draws import draws
 from skeleton_files import FIRST_ID, skeleton_text
@@ -71,6 +71,13 @@ def test_coordinates_that_are_not_finite(tmp_path):
     assert np.isnan(found.skeletons[0].positions[7]).all()
     assert found.skeletons[0].states[7] == TrackingState.NOT_TRACKED
     assert recording.problems == {NOT_FINITE: 1}
+
+
+def test_coordinates_in_millimetres_are_counted(tmp_path):
+    ((identity, _, states),) = bodies(np.random.default_rng(0), 1)
+    recording = NtuRecording(write(tmp_path / NAME, skeleton_text([[(identity, np.full((25, 3), 2400.0), states)]])))
+    list(recording)
+    assert recording.problems == {FAR: 25}
 
 
 def test_a_file_cut_anywhere_is_refused_or_read_up_to_its_last_whole_frame(tmp_path):

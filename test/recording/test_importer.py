@@ -136,6 +136,12 @@ def test_a_stamp_or_receipt_before_time_0_is_refused(tmp_path):
             import_files([frames(tmp_path / "a.csv", stamp, received=received)], tmp_path / "bag")
 
 
+def test_times_in_milliseconds_get_a_warning(tmp_path):
+    right, wrong = frames(tmp_path / "a.csv", 0, 0.033, 0.066), frames(tmp_path / "b.csv", 0, 33, 66)
+    report = import_files([right, wrong], tmp_path / "bag")
+    assert report.warnings == ["kinect2: 33 s from one message to the next, in the mean: are its times in seconds?"]
+
+
 # --- the command
 
 
