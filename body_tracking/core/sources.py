@@ -9,18 +9,18 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.core.skeleton import MAX_RANGE, Skeleton
+
+if TYPE_CHECKING:
+    from body_tracking.core.skeleton import Skeleton
 
 RESERVED_NAMES = ("fused", "filtered", "ground_truth", "imu")
 """First parts of topics that are not sensors."""
 
 NOT_FINITE = "joints without finite coordinates"
 """Counted in :attr:`Recording.problems`: such a joint is NaN and NOT_TRACKED."""
-FAR = f"joints farther away than {MAX_RANGE:.0f} m, which nothing uses: coordinates must be metres"
-"""Counted in :attr:`Recording.problems`: such a joint is imported as it is."""
 
 
 class SensorNameError(BodyTrackingError):

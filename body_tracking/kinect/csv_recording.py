@@ -17,12 +17,13 @@ import numpy as np
 
 from body_tracking.core.csv_file import CsvError, CsvFile
 from body_tracking.core.skeleton import JOINT_NAMES, MAX_RANGE, N_JOINTS, Skeleton, TrackingState
-from body_tracking.core.sources import FAR, NOT_FINITE, RecordedFrame, SensorNameError, check_sensor_name, optical_frame
+from body_tracking.core.sources import NOT_FINITE, RecordedFrame, SensorNameError, check_sensor_name, optical_frame
 from body_tracking.kinect.axes import camera_space_to_optical
 
 REPEATED = "stamps that repeat"
 BACKWARDS = "stamps that run backwards"
 IGNORED = "columns that were not read"
+FAR = f"joints farther away than {MAX_RANGE:.0f} m, which nothing uses: coordinates must be metres"
 
 _AXES = ("x", "y", "z")
 _COORDINATES = [f"{joint}_{axis}" for joint in JOINT_NAMES for axis in _AXES]

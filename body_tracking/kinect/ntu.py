@@ -30,8 +30,9 @@ from body_tracking.core.skeleton import (
     Skeleton,
     TrackingState,
 )
-from body_tracking.core.sources import FAR, NOT_FINITE, RecordedFrame, check_sensor_name, optical_frame
+from body_tracking.core.sources import NOT_FINITE, RecordedFrame, check_sensor_name, optical_frame
 from body_tracking.kinect.axes import camera_space_to_optical
+from body_tracking.kinect.csv_recording import FAR
 
 FRAME_RATE = 30
 """Hertz, nominal."""

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from body_tracking.core.skeleton import TrackingState
-from body_tracking.core.sources import FAR, NOT_FINITE
+from body_tracking.core.sources import NOT_FINITE
+from body_tracking.kinect.csv_recording import FAR
 from body_tracking.kinect.ntu import EMPTY, NtuError, NtuRecording, sensor_of
 from draws import draws
 from skeleton_files import FIRST_ID, skeleton_text
