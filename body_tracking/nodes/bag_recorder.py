@@ -17,13 +17,13 @@ from std_srvs.srv import Trigger
 from body_tracking.core import names
 from body_tracking.core.clocks import jumped_back
 from body_tracking.core.errors import BodyTrackingError
-from body_tracking.core.parameters import Parameter, Value
+from body_tracking.core.parameters import Parameter, ParameterError, Value
 from body_tracking.core.qos import LATCHED, Qos, request_for
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.graph import is_model_covariance
 from body_tracking.recording.rosbag2 import BagError, BagWriter
 from body_tracking.ros.bag_topics import from_profile, message_class, to_profile
-from body_tracking.ros.main import run
+from body_tracking.ros.main import RCLError, run
 from body_tracking.ros.node import STEADY, GraphNode
 
 PARAMETERS = (
@@ -104,12 +104,23 @@ class BagRecorder(GraphNode):
 
     def configure(self, values: Mapping[str, Value]) -> None:
         given: dict[str, Any] = dict(values)
+        chosen, exclude = (self.topics_in(name, given[name]) for name in ("topics", "exclude"))
+        self.chosen, self.exclude = chosen, exclude
         self.named = bool(given["folder"])
         if self.named:
             self.use_folder(Path(given["folder"]).expanduser())
-        self.chosen = frozenset(map(self.resolve_topic_name, given["topics"]))
-        self.exclude = frozenset(map(self.resolve_topic_name, given["exclude"]))
         self.model_covariance = bool(given["model_covariance"])
+
+    def topics_in(self, parameter: str, topics: tuple[str, ...]) -> frozenset[str]:
+        """The full names of a parameter's topics; ParameterError where one is none."""
+        found = set()
+        for topic in topics:
+            try:
+                found.add(self.resolve_topic_name(topic))
+            except RCLError as error:
+                reason = str(error).partition(", at ")[0]  # then the line in the source of rcl
+                raise ParameterError(f"parameter {parameter!r}: {topic!r:.80} is no topic ({reason})") from error
+        return frozenset(found)
 
     def use_folder(self, folder: Path) -> None:
         """Record into this folder from the next start on."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final
 
 import viser
@@ -15,7 +15,7 @@ from body_tracking.messages.node_status import NodeStatus
 from body_tracking.pipeline.graph import END
 from body_tracking.viewing.handles import show
 from body_tracking.viewing.plots import NONE
-from body_tracking.viewing.snapshot import Controls
+from body_tracking.viewing.snapshot import Controls, PageError
 from body_tracking.viewing.state import CALIBRATION, PLAYER, RECORDER, fresh, state_html
 
 BUTTONS: Final[Mapping[str, tuple[str, Mapping[str, str]]]] = {
@@ -147,7 +147,7 @@ class ControlPanel:
         @buttons.on_click
         def _(event: viser.GuiEvent[Any]) -> None:
             pressed = buttons.value
-            self._answer(f"{label}: {pressed}", lambda: self._controls.call(services[pressed]))
+            self._answer(f"{label}: {pressed:.40}", lambda: self._controls.call(services[one_of(services, pressed)]))
 
         return buttons
 
@@ -158,7 +158,7 @@ class ControlPanel:
         def _(event: viser.GuiEvent[Any]) -> None:
             if event.client is not None:  # None for updates by draw and draw_bodies
                 chosen = dropdown.value
-                if not self._answer(label, lambda: choose(chosen)):
+                if not self._answer(label, lambda: choose(one_of(dropdown.options, chosen))):
                     self._running.clear()  # so that the lists show again what runs
 
         return dropdown
@@ -175,3 +175,10 @@ class ControlPanel:
             note.body, note.color = text, "red" if refused else "teal"
             note.loading, note.auto_close_seconds = False, 8.0
         return not refused
+
+
+def one_of(options: Iterable[str], chosen: str) -> str:
+    """The choice, which comes from a browser; PageError where it is none of the options."""
+    if chosen not in options:
+        raise PageError(f"{chosen!r:.40} is none of {', '.join(options)}")
+    return chosen

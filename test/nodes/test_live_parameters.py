@@ -220,6 +220,22 @@ def test_the_player_plays_faster(running: Graph) -> None:
     assert running.set("bag_player", rate=1.0) == [(True, "")]
 
 
+def test_what_is_no_topic_is_refused_by_name_and_nothing_changes(running: Graph) -> None:
+    before = running.get("bag_recorder", ["folder", "topics", "exclude"])
+    for name in ("topics", "exclude"):
+        value = ParameterValue(type=ParameterType.PARAMETER_STRING_ARRAY, string_array_value=["/a b"])
+        [(done, reason)] = running.set("bag_recorder", **{name: value})
+        assert not done
+        assert reason.startswith(f"bag_recorder: parameter {name!r}: '/a b' is no topic (")
+    assert running.get("bag_recorder", ["folder", "topics", "exclude"]) == before
+
+
+def test_a_place_beyond_all_recordings_is_refused_by_name(running: Graph) -> None:
+    [(done, reason)] = running.set("bag_player", position=1e308)
+    assert not done
+    assert reason.startswith("bag_player: parameter 'position': 1e+308, expected 0 to 1e+09")
+
+
 def test_the_recorder_changes_its_bag_between_two_recordings_only(running: Graph) -> None:
     first, second = running.folder / "first", running.folder / "second"
     assert running.call(Trigger, "/recorder/start", Trigger.Request()).success

@@ -17,7 +17,7 @@ import pytest
 pytest.importorskip("viser", reason="viser is not installed")
 
 from body_tracking.messages.node_status import NodeStatus
-from body_tracking.viewing.panel import ControlPanel
+from body_tracking.viewing.panel import ControlPanel, one_of
 from body_tracking.viewing.server import serve, stop
 from body_tracking.viewing.snapshot import PageError
 from patience import PATIENCE
@@ -94,6 +94,21 @@ def test_after_a_refusal_the_list_shows_what_runs(page: SimpleNamespace) -> None
     page.angles.handle()
     page.report("model")
     assert page.angles.value == "model"
+
+
+def test_what_is_none_of_the_options_is_refused_and_not_passed_on(page: SimpleNamespace) -> None:
+    page.report("model")
+    page.angles.receive("/nonexistent")
+    page.angles.handle()
+    page.controls.choose_convention.assert_not_called()
+    page.report("model")
+    assert page.angles.value == "model"
+
+
+def test_a_choice_of_the_page_is_one_of_its_options() -> None:
+    assert one_of(("body1", "body2"), "body2") == "body2"
+    with pytest.raises(PageError, match=r"'x+ is none of body1, body2"):
+        one_of(("body1", "body2"), "x" * 1_000_000)
 
 
 @pytest.fixture
