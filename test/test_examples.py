@@ -62,6 +62,22 @@ def test_angles_of_a_missing_recording_are_refused_in_one_line(tmp_path: Path) -
     assert done.returncode == 2 and done.stderr == f"drive: {bag}: no such recording\n"
 
 
+def test_a_time_or_a_picture_that_is_none_is_named(tmp_path: Path) -> None:
+    words = [sys.executable, str(ROOT / "examples" / "robot_arms" / "drive.py"), "two_joint_arm", "--bag", "bag"]
+    for option, value, named in (
+        ("--kill", "nan", "--kill: nan, expected seconds from 0 on"),
+        ("-o", str(tmp_path), f"--output: {tmp_path} is a folder, expected a file"),
+    ):
+        done = subprocess.run(
+            [*words, option, value],
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+            timeout=100,
+        )
+        assert done.returncode == 2 and done.stderr.endswith(f"drive.py: error: {named}\n")
+
+
 @pytest.mark.slow
 def test_the_notebook_plots_a_recording(tmp_path: Path, wave: Path) -> None:
     """Its cells, run one after the other as a program, of a recording that lacks a message of a pair."""

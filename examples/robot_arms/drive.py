@@ -305,6 +305,10 @@ def main() -> int:
     args = made.parse_args()
     if args.bag is None and (args.angles or args.kill is not None):
         made.error("--angles and --kill need --bag")
+    if args.kill is not None and not 0.0 <= args.kill < np.inf:
+        made.error(f"--kill: {args.kill:g}, expected seconds from 0 on")
+    if args.output is not None and args.output.is_dir():
+        made.error(f"--output: {args.output} is a folder, expected a file")
     file = ROBOTS / f"{args.robot}.yaml"
     try:
         domain(os.environ)
@@ -339,7 +343,11 @@ def main() -> int:
         return code or 1
     print(f"\n{mapping.robot}: {node.commands} commands\n{report(node)}")
     if args.output is not None:
-        draw(node, args.output)
+        try:
+            draw(node, args.output)
+        except OSError as error:
+            print(f"drive: {args.output}: the picture cannot be written ({error.strerror})", file=sys.stderr)
+            return code or 2
         print(f"picture: {args.output}")
     return code
 
