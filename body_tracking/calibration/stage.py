@@ -17,6 +17,7 @@ from body_tracking.core.qos import LATCHED, Qos
 from body_tracking.core.repeats import Repeats
 from body_tracking.core.sensor_poses import CalibrationResult
 from body_tracking.core.skeleton import NANOSECONDS, Joint, Skeleton
+from body_tracking.core.sources import optical_frame
 from body_tracking.messages.codecs import Clock, Pose, Poses, SensorClock
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.people import SubjectSelector
@@ -94,6 +95,9 @@ class CalibrationStage(Stage):
         self._repeats = {sensor: Repeats() for sensor in sensors}
         self._odd: dict[str, tuple[int, float]] = {}
         """Frames in a row with an impossible trunk, and its last length, metres."""
+        self._frames = {optical_frame(sensor): sensor for sensor in sensors}
+        self._foreign: dict[str, str] = {}
+        """The frame of the last skeletons of each sensor where it is that of another sensor."""
         self._sensors = {graph.skeleton_topic(sensor): sensor for sensor in sensors}
         self.inputs = tuple(skeleton_input(topic, values) for topic in self._sensors)
         world = str(values["world_frame"])
@@ -121,6 +125,7 @@ class CalibrationStage(Stage):
         sensor = self._sensors[topic]
         for skeleton in payload[:1]:
             self._check_size(sensor, skeleton)
+            self._check_frame(sensor, skeleton.frame_id)
             self._check_time(skeleton)
         subject = self._subjects[sensor].pick(payload)
         if subject is None or self._repeats[sensor].add(subject.stamp_ns, subject.positions):
@@ -156,6 +161,13 @@ class CalibrationStage(Stage):
         elif 0.0 < length < math.inf:  # nor NaN, nor zeros in place of joints
             self._odd[sensor] = self._odd.get(sensor, (0, 0.0))[0] + 1, length
 
+    def _check_frame(self, sensor: str, frame: str) -> None:
+        """Note the frame of another sensor; any other frame may be the name that a driver gives to its own."""
+        if self._frames.get(frame, sensor) != sensor:
+            self._foreign[sensor] = frame
+        else:
+            self._foreign.pop(sensor, None)
+
     def _check_time(self, skeleton: Skeleton) -> None:
         """Count the frames in a row that come from a recording, whoever plays it, and in whatever time.
 
@@ -179,6 +191,7 @@ class CalibrationStage(Stage):
             for sensor, (count, length) in self._odd.items()
             if count >= _ODD_FRAMES
         ]
+        odd += [f"{sensor}: its skeletons are in {frame}, of another sensor" for sensor, frame in self._foreign.items()]
         return (1, "; ".join((*odd, text)), values) if odd else (level, text, values)
 
     def save(self) -> None:

@@ -367,8 +367,11 @@ class FilterStage(Stage):
         if self._t_poses > before:
             self.events.append("joint centres of this person estimated from a T-pose: angles are more accurate now")
         name, frozen = str(self.values["filter"]), "" if self._people is None else self._people.frozen
-        text = f"{name} ({frozen})" if frozen else name
-        return int(bool(frozen)), text, {"tracked": ", ".join(self._tracked_ids()), **counters}
+        absent = [each for each in dict.fromkeys(names_in(self.values["not_kinects"])) if each not in self._received]
+        strange = f"not_kinects: no sensor {', '.join(absent)} here" if absent and self._received else ""
+        notes = [note for note in (frozen, strange) if note]
+        text = f"{name} ({'; '.join(notes)})" if notes else name
+        return int(bool(notes)), text, {"tracked": ", ".join(self._tracked_ids()), **counters}
 
     @property
     def counters(self) -> Mapping[str, int]:

@@ -156,6 +156,8 @@ def options_for(args: argparse.Namespace, found: Mapping[str, Value] = MappingPr
     if options["robot"] and options["lag"]:
         raise UpError("lag: a robot must not follow angles that come late")
     if args.bag is not None:
+        used = [each for each in names_in(options["with_covariances"]) if each in names_in(options["sensors"])]
+        options = {**options, "with_covariances": tuple(used)}
         try:
             options = {**options, "played": played(options, topics)}
         except graph.GraphError as error:

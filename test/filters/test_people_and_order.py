@@ -252,3 +252,14 @@ def test_orientations_alone_are_published_at_the_rate_of_predicted_frames(lag: f
     # of three sensors of 50 Hz every second one, of the two seconds after the start
     assert stage.counters["orientations_used"] >= 3 * 2 * 25 - 3
     assert "orientations_used" not in linear.counters
+
+
+def test_names_in_not_kinects_that_no_sensor_has_are_reported() -> None:
+    values = {"filter": "ekf", "sensors": ("kinect1", "azure1")}
+    for names, note in {
+        (): "ekf",
+        ("azure1",): "ekf",
+        ("azure1", "azure2", "azure2"): "ekf (not_kinects: no sensor azure2 here)",
+    }.items():
+        stage = FilterStage(check_all(FilterStage.PARAMETERS, {**values, "not_kinects": names}))
+        assert stage.state(0)[:2] == (int("(" in note), note)
