@@ -9,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from body_tracking.calibration.online import CalibrationParameters, CalibrationUpdate, OnlineCalibration
 from body_tracking.calibration.storage import load, save
 from body_tracking.core.names import TF_STATIC
@@ -130,6 +132,9 @@ class CalibrationStage(Stage):
         subject = self._subjects[sensor].pick(payload)
         if subject is None or self._repeats[sensor].add(subject.stamp_ns, subject.positions):
             return ()
+        if self._exists and len(payload) > 1:
+            # Two sensors may see different people as the nearest one, whose motions would replace a good calibration.
+            subject = replace(subject, positions=np.full_like(subject.positions, np.nan))
         updates = self.calibration.push(sensor, subject, now.ros_ns)
         self._unsaved |= bool(updates)
         self.events += self.calibration.events

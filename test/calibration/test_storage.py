@@ -22,6 +22,8 @@ from body_tracking.core.skeleton import NANOSECONDS, Skeleton, TrackingState
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.stage import Now
 from body_tracking.recording.rosbag2 import BAG_WIRE
+from body_tracking.simulation.layouts import around
+from body_tracking.simulation.scene import Setup, simulate
 
 BODY = np.random.default_rng(0).normal(scale=0.3, size=(25, 3)) + [0.0, 0.0, 2.0]
 TRACKED = np.full(25, TrackingState.TRACKED, dtype=np.uint8)
@@ -99,6 +101,24 @@ def test_a_recording_played_beside_changes_no_existing_file(tmp_path: Path, stam
     assert (path.read_text() == before) is kept
     text = stage.state(at_ns)[1]
     assert ("room.yaml is not written, as the stamps are those of a recording: 3" in text) is kept
+
+
+def test_several_people_leave_the_poses_of_a_file_as_they_are(tmp_path: Path) -> None:
+    """Each sensor follows the person nearest to it, here another one: their motions contradict the poses."""
+    recording = simulate(Setup("torso_twist", around(np.radians([0.0, 60.0]).tolist()), number=3, seconds=12.0))
+    poses = {sensor.pose.sensor: sensor.pose for sensor in recording.sensors}
+    quality = dict.fromkeys(poses, SensorQuality(0.05, 0.01, 0.004, 400))
+    save(CalibrationResult("kinect1", poses, dict.fromkeys(poses, ClockModel()), quality), tmp_path / "room.yaml")
+    values = {each.name: each.default for each in CalibrationStage.PARAMETERS}
+    file = {"calibration_file": str(tmp_path / "room.yaml"), "sensors": ("kinect1", "kinect2")}
+    stage = CalibrationStage(values | file)
+    before = stage.calibration.current_update().result.poses["kinect2"]
+    for frame in recording.frames:
+        now = Now(frame.received_ns, frame.received_ns)
+        list(stage.take(graph.skeleton_topic(frame.sensor), frame.skeletons, now))
+    after = stage.calibration.current_update().result.poses["kinect2"]
+    assert_allclose(after.translation, before.translation)
+    assert_allclose(after.rotation, before.rotation)
 
 
 def test_a_file_that_is_only_to_be_loaded_is_never_written(tmp_path: Path) -> None:
