@@ -181,6 +181,7 @@ class StageNode(GraphNode):
     def answer(self, action: Callable[[], str], request: Any, response: Any) -> Any:
         response.message, response.success = action(), True
         self.get_logger().info(response.message)
+        self._report()  # robot_commands must not wait a second to know that the calibration was reset
         return response
 
     def finish(self) -> None:

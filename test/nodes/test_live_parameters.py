@@ -236,6 +236,20 @@ def test_a_place_beyond_all_recordings_is_refused_by_name(running: Graph) -> Non
     assert reason.startswith("bag_player: parameter 'position': 1e+308, expected 0 to 1e+09")
 
 
+def test_a_reset_of_the_calibration_is_reported_at_once(running: Graph) -> None:
+    """``robot_commands`` follows until it is; just after a regular report the next one is due in a second."""
+    delays = []
+    for _ in range(2):
+        assert running.until(lambda: running.said("calibration").get("", "") == "calibrated", 60.0)
+        before = running.said("calibration")
+        assert running.until(lambda before=before: running.said("calibration") is not before)
+        begin = time.monotonic()
+        assert running.call(Trigger, "/calibration/reset", Trigger.Request()).success
+        assert running.until(lambda: "waiting for a still pose" in running.said("calibration").get("", ""))
+        delays.append(time.monotonic() - begin)
+    assert min(delays) < 0.5, delays
+
+
 def test_the_recorder_changes_its_bag_between_two_recordings_only(running: Graph) -> None:
     first, second = running.folder / "first", running.folder / "second"
     assert running.call(Trigger, "/recorder/start", Trigger.Request()).success
