@@ -78,6 +78,13 @@ def test_a_recording_of_angles_is_labelled_as_results(tmp_path: Path) -> None:
     assert found.content == "0.0 s, angles of body1, sensors kinect1" and not found.refusal
 
 
+def test_a_recording_that_was_cut_off_is_labelled_as_incomplete(tmp_path: Path) -> None:
+    (whole,) = (BAGS / "tpose_wave").glob("*.mcap")
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole.read_bytes()[:60_000])
+    assert described(cut).content.endswith(" s, incomplete, sensors kinect1, kinect2")
+
+
 def test_a_recording_without_frames_cannot_be_played(tmp_path: Path) -> None:
     """As one that was begun after the bag had ended."""
     found = described(written(tmp_path / "late", {"/kinect1/skeleton": POINT_CLOUD}, messages=False))

@@ -194,7 +194,9 @@ def _described(args: argparse.Namespace, bag: Path, where: str) -> Any:
         with RigReader(bag) as reader:
             types = {name: each.type_name for name, each in reader.topics.items()}
             counts = {name: each.count for name, each in reader.topics.items()}
-            length = f"{(reader.end_ns - reader.start_ns) / NANOSECONDS:.1f} s"
+            length = (
+                f"{(reader.end_ns - reader.start_ns) / NANOSECONDS:.1f} s{', incomplete' if reader.warnings else ''}"
+            )
     except BodyTrackingError as error:
         return Recording(bag, where, "cannot be read", str(error).replace(f"{bag}/", ""))
     bodies = graph.bodies_among(types)
