@@ -108,5 +108,8 @@ def test_cameras_whose_skeletons_a_recording_has_are_not_corrected_as_kinects(tm
                 writer.write(f"/{sensor}/skeleton", Skeletons().encode((seen,), BAG_WIRE), 1)
     parser = argparse.ArgumentParser()
     replay.add_parser(parser.add_subparsers())
-    settings = replay.settings_from(parser.parse_args(["replay", str(tmp_path / "session"), "-o", "out"]))
+    words = ["replay", str(tmp_path / "session"), "-o", "out"]
+    settings = replay.settings_from(parser.parse_args(words))
     assert settings.parameters["skeleton_filter"]["not_kinects"] == ("camera1",)
+    settings = replay.settings_from(parser.parse_args([*words, "--sensors", "kinect1,kinect2"]))
+    assert not settings.parameters["skeleton_filter"].get("not_kinects")  # the filter names those that are not there
