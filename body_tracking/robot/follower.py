@@ -22,6 +22,8 @@ of ``STANDSTILL`` stop at once, without holding.
 
 The caller passes two times: ``now_ns`` in ROS time, as stamps are (it may stand still or jump), and ``steady_ns``,
 which is monotonic. This is not a safety-rated function.
+
+Over 500 lines: one state machine with all its faults, which are checked in their order.
 """
 
 from __future__ import annotations
