@@ -97,9 +97,8 @@ class CalibrationStage(Stage):
         self._repeats = {sensor: Repeats() for sensor in sensors}
         self._odd: dict[str, tuple[int, float]] = {}
         """Frames in a row with an impossible trunk, and its last length, metres."""
-        self._frames = {optical_frame(sensor): sensor for sensor in sensors}
-        self._foreign: dict[str, str] = {}
-        """The frame of the last skeletons of each sensor where it is that of another sensor."""
+        self._frames: dict[str, str] = {}
+        """The frame of each sensor's last skeletons."""
         self._sensors = {graph.skeleton_topic(sensor): sensor for sensor in sensors}
         self.inputs = tuple(skeleton_input(topic, values) for topic in self._sensors)
         world = str(values["world_frame"])
@@ -127,13 +126,14 @@ class CalibrationStage(Stage):
         sensor = self._sensors[topic]
         for skeleton in payload[:1]:
             self._check_size(sensor, skeleton)
-            self._check_frame(sensor, skeleton.frame_id)
+            self._frames[sensor] = skeleton.frame_id
             self._check_time(skeleton)
         subject = self._subjects[sensor].pick(payload)
         if subject is None or self._repeats[sensor].add(subject.stamp_ns, subject.positions):
             return ()
         if self._exists and len(payload) > 1:
-            # Two sensors may see different people as the nearest one, whose motions would replace a good calibration.
+            # Two sensors may follow different people, whose motions would replace a good calibration. A frame without
+            # points still says that the sensor sends, and how late.
             subject = replace(subject, positions=np.full_like(subject.positions, np.nan))
         updates = self.calibration.push(sensor, subject, now.ros_ns)
         self._unsaved |= bool(updates)
@@ -166,13 +166,6 @@ class CalibrationStage(Stage):
         elif 0.0 < length < math.inf:  # nor NaN, nor zeros in place of joints
             self._odd[sensor] = self._odd.get(sensor, (0, 0.0))[0] + 1, length
 
-    def _check_frame(self, sensor: str, frame: str) -> None:
-        """Note the frame of another sensor; any other frame may be the name that a driver gives to its own."""
-        if self._frames.get(frame, sensor) != sensor:
-            self._foreign[sensor] = frame
-        else:
-            self._foreign.pop(sensor, None)
-
     def _check_time(self, skeleton: Skeleton) -> None:
         """Count the frames in a row that come from a recording, whoever plays it, and in whatever time.
 
@@ -196,7 +189,13 @@ class CalibrationStage(Stage):
             for sensor, (count, length) in self._odd.items()
             if count >= _ODD_FRAMES
         ]
-        odd += [f"{sensor}: its skeletons are in {frame}, of another sensor" for sensor, frame in self._foreign.items()]
+        # any other frame may be the name that a driver gives to its own
+        others = {optical_frame(sensor): sensor for sensor in self._sensors.values()}
+        odd += [
+            f"{sensor}: its skeletons are in {frame}, of another sensor"
+            for sensor, frame in self._frames.items()
+            if others.get(frame, sensor) != sensor
+        ]
         return (1, "; ".join((*odd, text)), values) if odd else (level, text, values)
 
     def save(self) -> None:

@@ -54,7 +54,7 @@ from body_tracking.messages.model import (
     image_to_covariance,
     joint_state_to_model,
 )
-from body_tracking.messages.skeletons import check_covariances, cloud_to_skeletons
+from body_tracking.messages.skeletons import checked_covariances, cloud_to_skeletons
 
 
 class Wire(Protocol):
@@ -131,7 +131,7 @@ class Skeletons(Codec):
         return encode_skeletons(list(payload))
 
     def decode(self, cdr: bytes, wire: Wire) -> tuple[Skeleton, ...]:
-        return check_covariances(decode_skeletons(cdr) or cloud_to_skeletons(wire.deserialize(POINT_CLOUD, cdr)))
+        return checked_covariances(decode_skeletons(cdr) or cloud_to_skeletons(wire.deserialize(POINT_CLOUD, cdr)))
 
     def stamp_ns(self, payload: Sequence[Skeleton]) -> int:
         return payload[0].stamp_ns

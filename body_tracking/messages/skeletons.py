@@ -93,7 +93,7 @@ def cloud_to_skeletons(cloud: Any) -> tuple[Skeleton, ...]:
     )
 
 
-def check_covariances(skeletons: tuple[Skeleton, ...]) -> tuple[Skeleton, ...]:
+def checked_covariances(skeletons: tuple[Skeleton, ...]) -> tuple[Skeleton, ...]:
     """The bodies, without covariances where all are zero: in ROS, zero stands for an unknown covariance.
 
     Raises:

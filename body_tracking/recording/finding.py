@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Final
@@ -119,10 +119,17 @@ def _option(flag: str) -> Option:
     return OPTIONS[flag.removeprefix("--").replace("-", "_")]
 
 
-def with_covariances(bag: BagReader) -> tuple[str, ...]:
-    """The sensors in a recording whose skeletons have covariances: cameras and others, but no Kinect v2."""
+def with_covariances(bag: BagReader, wanted: Collection[str] = ()) -> tuple[str, ...]:
+    """The sensors in a recording whose skeletons have covariances: cameras and others, but no Kinect v2.
+
+    Args:
+        bag: open.
+        wanted: sensor names; all in the bag when empty.
+    """
     found = []
     for sensor in graph.sensors_among(bag.topics):
+        if wanted and sensor not in wanted:
+            continue
         topic = graph.skeleton_topic(sensor)
         first = next(iter(bag.messages({topic})), None) if bag.topics[topic].type_name == POINT_CLOUD else None
         with contextlib.suppress(BodyTrackingError):  # a malformed message; who reads them all counts it

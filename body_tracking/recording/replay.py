@@ -355,12 +355,10 @@ _NAMED: Final = ("sensors", "filter", "convention", "calibration", "imus", "para
 
 def settings_from(args: argparse.Namespace) -> ReplaySettings:
     """The settings of a command line."""
+    options: dict[str, Any] = {**with_file(options_of(**{**options_from(args), "external": True}), args.params_file)}
     with BagReader(args.bag) as bag:
-        given = {**options_from(args), "external": True, "with_covariances": with_covariances(bag)}
-    options: dict[str, Any] = {**with_file(options_of(**given), args.params_file)}
-    if args.sensors or options["computed"]:  # else all sensors in the bag
-        used = [each for each in options["with_covariances"] if each in options["sensors"]]
-        options["with_covariances"] = tuple(used)
+        wanted = options["sensors"] if args.sensors or options["computed"] else ()
+        options["with_covariances"] = with_covariances(bag, wanted)
     specs = stage_hosts(nodes_for(options))
     left = ("use_sim_time", "sensors", "calibration_file", *OFFLINE)
     parameters = {

@@ -141,7 +141,7 @@ def options_for(args: argparse.Namespace, found: Mapping[str, Value] = MappingPr
             topics = frozenset(reader.topics)
             types = {name: each.type_name for name, each in reader.topics.items()}
             there = graph.sensors_among(reader.topics)
-            given["with_covariances"] = with_covariances(reader)
+            stated = with_covariances(reader)
             duration = (reader.end_ns - reader.start_ns) / NANOSECONDS
         if args.start and not 0.0 < args.start < duration:
             raise UpError(f"start {args.start:g}: the bag lasts {duration:.1f} s")
@@ -156,8 +156,8 @@ def options_for(args: argparse.Namespace, found: Mapping[str, Value] = MappingPr
     if options["robot"] and options["lag"]:
         raise UpError("lag: a robot must not follow angles that come late")
     if args.bag is not None:
-        used = [each for each in names_in(options["with_covariances"]) if each in names_in(options["sensors"])]
-        options = {**options, "with_covariances": tuple(used)}
+        sensors = names_in(options["sensors"])
+        options = {**options, "with_covariances": tuple(each for each in stated if each in sensors)}
         try:
             options = {**options, "played": played(options, topics)}
         except graph.GraphError as error:

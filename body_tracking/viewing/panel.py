@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, Final
 
 import viser
 
-from body_tracking.core.errors import BodyTrackingError
+from body_tracking.core.errors import BodyTrackingError, one_of
 from body_tracking.messages.node_status import NodeStatus
 from body_tracking.pipeline.graph import END
 from body_tracking.viewing.handles import show
@@ -147,7 +147,7 @@ class ControlPanel:
         @buttons.on_click
         def _(event: viser.GuiEvent[Any]) -> None:
             pressed = buttons.value
-            self._answer(f"{label}: {pressed:.40}", lambda: self._controls.call(services[one_of(services, pressed)]))
+            self._answer(f"{label}: {pressed:.40}", lambda: self._controls.call(services[checked(pressed, services)]))
 
         return buttons
 
@@ -158,7 +158,7 @@ class ControlPanel:
         def _(event: viser.GuiEvent[Any]) -> None:
             if event.client is not None:  # None for updates by draw and draw_bodies
                 chosen = dropdown.value
-                if not self._answer(label, lambda: choose(one_of(dropdown.options, chosen))):
+                if not self._answer(label, lambda: choose(checked(chosen, dropdown.options))):
                     self._running.clear()  # so that the lists show again what runs
 
         return dropdown
@@ -177,8 +177,8 @@ class ControlPanel:
         return not refused
 
 
-def one_of(options: Iterable[str], chosen: str) -> str:
+def checked(chosen: str, options: Collection[str]) -> str:
     """The choice, which comes from a browser; PageError where it is none of the options."""
     if chosen not in options:
-        raise PageError(f"{chosen!r:.40} is none of {', '.join(options)}")
+        raise PageError(f"{chosen!r:.40}, {one_of(chosen[:40], options)}")
     return chosen

@@ -55,7 +55,7 @@ def test_a_person_who_walks_or_bends_down_is_not() -> None:
 
 
 @pytest.mark.parametrize(
-    ("sensor", "frame", "told"),
+    ("sensor", "frame", "reported"),
     [
         ("kinect1", "kinect2_optical_frame", True),
         ("kinect1", "kinect1_optical_frame", False),
@@ -63,7 +63,7 @@ def test_a_person_who_walks_or_bends_down_is_not() -> None:
         ("kinect1", "", False),
     ],
 )
-def test_skeletons_in_the_frame_of_another_sensor_are_reported(sensor: str, frame: str, told: bool) -> None:
+def test_skeletons_in_the_frame_of_another_sensor_are_reported(sensor: str, frame: str, reported: bool) -> None:
     """As of two drivers that are mixed up; a driver may give its own frame any other name."""
     stage = CalibrationStage(check_all(CalibrationStage.PARAMETERS, {"sensors": ("kinect1", "kinect2")}))
     for own in (frame, f"{sensor}_optical_frame"):
@@ -71,7 +71,7 @@ def test_skeletons_in_the_frame_of_another_sensor_are_reported(sensor: str, fram
         list(stage.take(graph.skeleton_topic(sensor), (skeleton,), Now(NANOSECONDS, NANOSECONDS)))
         level, text = stage.state(0)[:2]
         named = f"{sensor}: its skeletons are in {frame}, of another sensor; "
-        assert (level == 1 and text.startswith(named)) == (told and own == frame)
+        assert (level == 1 and text.startswith(named)) == (reported and own == frame)
 
 
 @pytest.mark.parametrize("unit", [1000.0, 100.0, 0.01])
