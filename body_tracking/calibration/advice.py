@@ -10,7 +10,9 @@ from body_tracking.messages.node_status import NodeStatus
 WAITING: Final = "waiting for a still pose"
 ROUGH: Final = "roughly calibrated, walk about to refine"
 APART: Final = "do not see the same pose"
+SEVERAL: Final = "several people are in view"
 _NEXT: Final = {
+    SEVERAL: "leave one person in view until the sensors are calibrated: each sensor may follow another one",
     WAITING: "hold a T-pose (arms straight, level and sideways) for four seconds where all sensors see you",
     ROUGH: "walk about and turn where all sensors see you",
     APART: "be alone in view, and turn your front to each sensor: one sees another person, or takes back for front",

@@ -11,6 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from body_tracking.calibration.advice import SEVERAL
 from body_tracking.calibration.online import CalibrationParameters, CalibrationUpdate, OnlineCalibration
 from body_tracking.calibration.storage import load, save
 from body_tracking.core.names import TF_STATIC
@@ -99,6 +100,8 @@ class CalibrationStage(Stage):
         """Frames in a row with an impossible trunk, and its last length, metres."""
         self._frames: dict[str, str] = {}
         """The frame of each sensor's last skeletons."""
+        self._several: set[str] = set()
+        """The sensors with several people in their last frame."""
         self._sensors = {graph.skeleton_topic(sensor): sensor for sensor in sensors}
         self.inputs = tuple(skeleton_input(topic, values) for topic in self._sensors)
         world = str(values["world_frame"])
@@ -128,6 +131,7 @@ class CalibrationStage(Stage):
             self._check_size(sensor, skeleton)
             self._frames[sensor] = skeleton.frame_id
             self._check_time(skeleton)
+        (self._several.add if len(payload) > 1 else self._several.discard)(sensor)
         subject = self._subjects[sensor].pick(payload)
         if subject is None or self._repeats[sensor].add(subject.stamp_ns, subject.positions):
             return ()
@@ -179,6 +183,8 @@ class CalibrationStage(Stage):
 
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
         level, text, values = self.calibration.status()
+        if level and self._several:
+            text += f"; {SEVERAL} of {', '.join(sorted(self._several))}"
         if self._exists and self.values["save"] and self._recorded >= _ODD_FRAMES:
             text += (
                 f"; {self._file} is not written, as the stamps are those of a recording: {self._recorded_s:.0f} s "

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from body_tracking.calibration.advice import next_step, quality
+from body_tracking.calibration.advice import SEVERAL, next_step, quality
 from body_tracking.calibration.online import MAX_TRANSLATION_STDDEV, CalibrationParameters, OnlineCalibration
 from body_tracking.calibration.rigid import CalibrationError
 from body_tracking.calibration.storage import save, to_dict
@@ -86,6 +86,8 @@ def calibrate(
         raise CalibrationError(f"{bag_path}: no frame can be used ({'; '.join(events) or 'there is none'})")
     result = calibration.finish()
     level, text, values = calibration.status()
+    if level and counters["frames with several bodies"]:
+        text += f"; {SEVERAL}"
     status = NodeStatus("calibration", level, text, {key: str(value) for key, value in values.items()})
     missing = [name for name in names if name not in result.poses]
     if missing:

@@ -201,7 +201,8 @@ def skeletons_of(
 ) -> Iterator[tuple[str, Skeleton, int, bytes]]:
     """Each sensor's frames in log-time order: sensor, the body nearest to it, log time, and the message.
 
-    A selected body is kept while it is tracked. Unusable frames are counted and skipped.
+    A selected body is kept while it is tracked. Unusable frames are counted and skipped, those with several bodies
+    counted.
     """
     subjects = {sensor: SubjectSelector() for sensor in topics.values()}
     last: dict[str, int] = {}
@@ -216,6 +217,8 @@ def skeletons_of(
         if jumped_back(stamp, last.get(sensor)):
             subjects[sensor].reset()
         last[sensor] = stamp
+        if len(skeletons) > 1:
+            counters["frames with several bodies"] += 1
         subject = subjects[sensor].pick(skeletons)
         if subject is None:
             counters["frames without a body"] += 1

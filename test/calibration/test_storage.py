@@ -13,12 +13,14 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
+from body_tracking.calibration.advice import next_step
 from body_tracking.calibration.rigid import CalibrationError
 from body_tracking.calibration.stage import CalibrationStage
 from body_tracking.calibration.storage import load, save
 from body_tracking.core.clocks import ClockModel
 from body_tracking.core.sensor_poses import CalibrationResult, SensorPose, SensorQuality, level_pose
 from body_tracking.core.skeleton import NANOSECONDS, Skeleton, TrackingState
+from body_tracking.messages.node_status import NodeStatus
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.stage import Now
 from body_tracking.recording.rosbag2 import BAG_WIRE
@@ -119,6 +121,20 @@ def test_several_people_leave_the_poses_of_a_file_as_they_are(tmp_path: Path) ->
     after = stage.calibration.current_update().result.poses["kinect2"]
     assert_allclose(after.translation, before.translation)
     assert_allclose(after.rotation, before.rotation)
+
+
+def test_several_people_are_named_until_the_sensors_are_calibrated() -> None:
+    frames = simulate(Setup("torso_twist", around(np.radians([0.0, 60.0]).tolist()), number=2, seconds=12.0)).frames
+    values = {each.name: each.default for each in CalibrationStage.PARAMETERS} | {"sensors": ("kinect1", "kinect2")}
+    stage = CalibrationStage(values)
+    for people in (2, 1):
+        for frame in frames[:60]:
+            now = Now(frame.received_ns, frame.received_ns)
+            list(stage.take(graph.skeleton_topic(frame.sensor), frame.skeletons[:people], now))
+        level, text, _ = stage.state(now.ros_ns)
+        assert level  # after two seconds without a movement
+        assert ("several people are in view of kinect1, kinect2" in text) is (people == 2)
+        assert next_step(NodeStatus("calibration", level, text)).startswith("leave one person in view") is (people == 2)
 
 
 def test_a_file_that_is_only_to_be_loaded_is_never_written(tmp_path: Path) -> None:
