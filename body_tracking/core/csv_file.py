@@ -51,8 +51,10 @@ class CsvFile:
             with open_regular(self.path) as raw:
                 size = max(1, os.fstat(raw.fileno()).st_size)
                 source = cast(BinaryIO, gzip.GzipFile(fileobj=raw)) if self.path.suffix == ".gz" else raw
-                with TextIOWrapper(source, encoding="utf-8-sig") as text:
+                # the text is decoded a block ahead of its lines: an error must name the line that is not UTF-8
+                with TextIOWrapper(source, encoding="utf-8-sig", errors="surrogateescape") as text:
                     for line in text:
+                        line.encode()
                         number += 1
                         self.progress = min(1.0, raw.tell() / size)
                         yield line
@@ -60,7 +62,7 @@ class CsvFile:
             self.cut = "the gzip stream is cut off"
         except (gzip.BadGzipFile, zlib.error) as error:
             raise self.error(number, f"the gzip stream is damaged ({error})") from error
-        except UnicodeDecodeError as error:
+        except UnicodeEncodeError as error:
             raise self.error(number, "not UTF-8 text") from error
         except OSError as error:
             raise CsvError(f"{self.path}: {error.strerror or error}") from error
@@ -68,12 +70,18 @@ class CsvFile:
     def rows(self, first: int, lines: list[str], separator: str = ",") -> list[list[str]]:
         """The cells of each line; ``first`` is the number of the first one. None for an empty line."""
         reader = csv.reader(lines, delimiter=separator, strict=True)
+        rows: list[list[str]] = []
+        fault = "a quoted cell goes on over several lines"
         try:
-            rows = list(reader)
+            for row in reader:
+                if reader.line_num > len(rows) + 1:
+                    break
+                rows.append(row)
         except csv.Error as error:
-            raise self.error(first + max(0, reader.line_num - 1), str(error)) from error
-        if len(rows) != len(lines):
-            raise self.error(first, "a quoted cell goes on over several lines")
+            if reader.line_num == len(rows) + 1:
+                fault = str(error)
+        if len(rows) < len(lines):
+            raise self.error(first + len(rows), fault)
         return rows
 
     def check_separator(self, header: list[str]) -> None:

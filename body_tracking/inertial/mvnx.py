@@ -12,6 +12,7 @@ the file's joint angles. The file has no angular rate of sensors; its normalised
 from __future__ import annotations
 
 import gzip
+import re
 import zlib
 from collections import Counter
 from collections.abc import Iterator
@@ -33,6 +34,7 @@ from body_tracking.core.imu import (
     imu_frame,
 )
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray
+from body_tracking.core.times import MAX_STAMP_NS
 
 SEGMENT_OF_SENSOR: Final = {
     "Pelvis": "pelvis",
@@ -52,6 +54,7 @@ SEGMENT_OF_SENSOR: Final = {
 
 LEGS: Final = "sensors that are not on the upper body"
 BAD: Final = "readings that no inertial sensor can have made"
+BACKWARDS: Final = "frames whose index does not advance"
 _AXES: Final = "xyz"
 
 
@@ -123,12 +126,20 @@ class MvnxRecording:
 
     def __iter__(self) -> Iterator[RecordedImu | RecordedAngles]:
         counts: Counter[str] = Counter()
+        last = -1
         for frame in self.frames():
             header = self.header
             assert header is not None
             if frame.kind != "normal":
                 continue
+            if last < 0:
+                others = [label for label in header.sensors if label not in SEGMENT_OF_SENSOR]
+                counts[f"{LEGS} ({', '.join(others)})"] = len(others)
+            counts[BACKWARDS] += frame.index <= last
+            last = frame.index
             stamp_ns = round(frame.index * NANOSECONDS / header.rate_hz)
+            if stamp_ns > MAX_STAMP_NS:
+                raise MvnxError(f"{self.path}, frame {frame.index}: no recording is that long")
             yield from self._readings(frame, header, stamp_ns, counts)
             if frame.joint_angles is not None:
                 names = tuple(f"{joint}_{axis}" for joint in header.joints for axis in _AXES)
@@ -143,7 +154,6 @@ class MvnxRecording:
         for number, label in enumerate(header.sensors):
             segment = SEGMENT_OF_SENSOR.get(label)
             if segment is None:
-                counts[LEGS] += frame.index == 0
                 continue
             quat_xyzw, force = frame.sensor_xyzw[number], None
             try:
@@ -203,7 +213,7 @@ class MvnxRecording:
             tag = element.tag.rpartition("}")[2]
             if event == "start":
                 if tag == "mvnx":
-                    version = element.get("version", "")
+                    version = element.get("version", "unknown")
                 elif tag == "subject":
                     rate = self._rate(element)
                 elif not version:
@@ -216,6 +226,9 @@ class MvnxRecording:
                     self.header = MvnxHeader(version, rate, *(tuple(labels[name]) for name in labels))
                     if not self.header.sensors:
                         raise MvnxError(f"{self.path}: no sensors")
+                    worn = [SEGMENT_OF_SENSOR[each] for each in self.header.sensors if each in SEGMENT_OF_SENSOR]
+                    if twice := [segment for segment, count in Counter(worn).items() if count > 1]:
+                        raise MvnxError(f"{self.path}: several sensors of the segment {twice[0]}")
             elif tag == "frame":
                 if self.header is None:
                     raise MvnxError(f"{self.path}: a frame before <frames>")
@@ -235,7 +248,7 @@ class MvnxRecording:
     def _frame(self, element: ElementTree.Element, header: MvnxHeader) -> MvnxFrame:
         kind, text = element.get("type", ""), element.get("index", "-1")
         where = f"{self.path}, frame {text if kind == 'normal' else kind}"
-        if not text.lstrip("-").isdigit() or (kind == "normal" and int(text) < 0):
+        if not re.fullmatch(r"-?[0-9]{1,18}", text) or (kind == "normal" and int(text) < 0):
             raise MvnxError(f"{where}: index {text!r}")
         found = {child.tag.rpartition("}")[2]: child.text or "" for child in element}
 

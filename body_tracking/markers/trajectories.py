@@ -26,7 +26,7 @@ DEFAULT_NOISE: Final = 5e-4
 """Metres, standard deviation of each coordinate: between vendors' specifications (0.2 mm) and balls on skin."""
 EMPTY: Final = "frames without a point"
 BACKWARDS: Final = "frames whose time does not advance"
-FAR: Final = "points too far away"
+FAR: Final = f"points farther away than {MAX_RANGE:.0f} m: is the unit of length right?"
 
 
 class TrajectoryError(BodyTrackingError):

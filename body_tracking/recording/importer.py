@@ -276,17 +276,17 @@ def import_files(
         dict(sorted(found.items())),
         (end_ns - start_ns) / NANOSECONDS,
         dict(sum((Counter(recording.problems) for recording in recordings), Counter())),
-        [warning for recording in recordings for warning in recording.warnings] + _too_slow(found),
+        [warning for recording in recordings for warning in recording.warnings] + _odd_rates(found),
     )
 
 
-def _too_slow(sensors: Mapping[str, ImportedSensor]) -> list[str]:
-    """A warning for each sensor whose mean interval between messages is over a second, as of stamps in milliseconds."""
+def _odd_rates(sensors: Mapping[str, ImportedSensor]) -> list[str]:
+    """A warning for each sensor whose mean interval is over a second or under 0.1 ms: its times have another unit."""
     intervals = {name: each.seconds / (each.frames - 1) for name, each in sensors.items() if each.frames > 1}
     return [
         f"{name}: {interval:.3g} s from one message to the next, in the mean: are its times in seconds?"
         for name, interval in sorted(intervals.items())
-        if interval > 1.0
+        if not 1e-4 <= interval <= 1.0
     ]
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from body_tracking.core.imu import STANDARD_GRAVITY, RecordedAngles, RecordedImu
-from body_tracking.inertial.mvnx import BAD, LEGS, MvnxError, MvnxRecording
+from body_tracking.inertial.mvnx import BACKWARDS, BAD, LEGS, MvnxError, MvnxRecording
 
 HEAD = """<?xml version="1.0"?>
 <mvnx xmlns="http://www.xsens.com/mvn/mvnx" version="4"><subject frameRate="60">
@@ -46,7 +46,7 @@ def test_a_recording(tmp_path: Path) -> None:
     assert later.sample.stamp_ns == later.received_ns == 50_000_000
     assert angles.names == ("jRightWrist_x", "jRightWrist_y", "jRightWrist_z")
     np.testing.assert_allclose(np.degrees(angles.angles), [10.0, -20.0, 90.0])
-    assert recording.problems == {LEGS: 1}
+    assert recording.problems == {f"{LEGS} (LeftFoot)": 1}
     assert recording.header is not None and recording.header.rate_hz == 60.0
     assert recording.progress == 1.0
 
@@ -69,6 +69,14 @@ def test_poses_stand_before_the_frames(tmp_path: Path) -> None:
         (WHOLE.replace("10 -20 90", "10 -20"), "frame 0, jointAngle: 2 numbers, expected 3"),
         (WHOLE.replace("0.5 1.25", "0.5 1,25"), "frame 0, position: could not convert string"),
         (WHOLE.replace('index="3"', 'index="x"'), "frame x: index 'x'"),
+        (WHOLE.replace('index="3"', 'index="²"'), "frame ²: index '²'"),
+        (WHOLE.replace('index="3"', 'index="--3"'), "frame --3: index '--3'"),
+        (WHOLE.replace('index="3"', f'index="{10**17}"'), "frame 1000.*: no recording is that long"),
+        (WHOLE.replace("LeftFoot", "RightHand"), "several sensors of the segment hand_right"),
+        (
+            WHOLE.replace("LeftFoot", "Sternum").replace('"RightHand"', '"T8"'),
+            "several sensors of the segment upper_trunk",
+        ),
         (WHOLE.replace("sensorOrientation", "sensorPosition"), "frame 0: no sensorOrientation"),
         (HEAD.replace('<sensor label="RightHand"/><sensor label="LeftFoot"/>', "") + TAIL, "no sensors"),
         (HEAD[: HEAD.index("<frame type")] + TAIL, "no frames"),
@@ -79,6 +87,13 @@ def test_a_malformed_file_says_where(tmp_path: Path, text: str, message: str) ->
     with pytest.raises(MvnxError, match=message) as error:
         list(MvnxRecording(written(tmp_path, text)))
     assert "suit.mvnx" in str(error.value) and "\n" not in str(error.value)
+
+
+def test_an_excerpt_counts_as_a_whole_file_does(tmp_path: Path) -> None:
+    text = WHOLE.replace('index="0"', 'index="7"').replace('index="3"', 'index="7"')
+    recording = MvnxRecording(written(tmp_path, text.replace(' version="4"', "")))
+    assert len(list(recording)) == 4
+    assert recording.problems == {f"{LEGS} (LeftFoot)": 1, BACKWARDS: 1}
 
 
 def test_a_zero_quaternion_is_left_out_and_counted(tmp_path: Path) -> None:

@@ -168,6 +168,9 @@ WRONG: list[tuple[Callable[[list[str]], str | bytes], str]] = [
     (lambda lines: lines[0] + "\n", "no rows"),
     (lambda lines: b"", "the file is empty"),
     (lambda lines: b"\xff\xfe\x00\x01", "line 1: not UTF-8"),
+    (lambda lines: "\n".join([*lines[:2], lines[2] + "\xe9 ", ""]).encode("latin-1"), "line 3: not UTF-8"),
+    (lambda lines: "\n".join([*lines[:2], '"' + lines[2], lines[3], ""]), "line 3: a quoted cell goes on"),
+    (lambda lines: "\n".join([*lines[:2], '"' + lines[2], lines[3] + '"', ""]), "line 3: a quoted cell goes on"),
     (lambda lines: b"stamp\n", "missing columns"),
     (
         lambda lines: b"time,left_elbow\n0,1\n",

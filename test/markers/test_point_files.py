@@ -168,7 +168,7 @@ def test_what_cannot_be_a_point_is_counted(tmp_path: Path) -> None:
     assert [len(frame.points.positions) for frame in recording] == [3, 2, 2, 0]
     assert recording.problems == {
         "frames whose time does not advance": 1,
-        "points too far away": 1,
+        "points farther away than 100 m: is the unit of length right?": 1,
         "frames without a point": 1,
     }
 

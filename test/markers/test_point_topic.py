@@ -130,7 +130,7 @@ def test_what_is_no_point_is_left_out_and_counted() -> None:
     assert {name: count for name, count in stage.counters.items() if count} == {
         "frames": 3,
         "points that are not finite": 2,
-        "points too far away": 1,
+        "points farther away than 100 m: is the unit of length right?": 1,
         "frames without a point": 2,
     }
     assert not refused

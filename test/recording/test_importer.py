@@ -142,6 +142,11 @@ def test_times_in_milliseconds_get_a_warning(tmp_path):
     assert report.warnings == ["kinect2: 33 s from one message to the next, in the mean: are its times in seconds?"]
 
 
+def test_times_of_receipt_that_are_all_the_same_get_a_warning(tmp_path):
+    report = import_files([frames(tmp_path / "a.csv", 0, 0.033, 0.066, received=5)], tmp_path / "bag")
+    assert report.warnings == ["kinect1: 0 s from one message to the next, in the mean: are its times in seconds?"]
+
+
 # --- the command
 
 
