@@ -126,6 +126,7 @@ def test_missing_files_are_reported_in_one_line(
         ("up --rate fast", "argument --rate: invalid float value: 'fast'", "body_tracking up"),
         ("replay bag", "the following arguments are required: -o/--output", "body_tracking replay"),
         ("camera show image.png -o out.png --large", "unrecognized arguments: --large", "body_tracking camera show"),
+        ("view --port 8081", "unrecognized arguments: --port 8081 (see ", "body_tracking view"),
         ("replya bag", "argument COMMAND: invalid choice: 'replya'; did you mean 'replay'?", "body_tracking"),
         ("up --filter efk", "argument --filter: invalid choice: 'efk'; did you mean 'ekf'?", "body_tracking up"),
         ("up --filter EKF", "argument --filter: invalid choice: 'EKF'; did you mean 'ekf'?", "body_tracking up"),
@@ -164,6 +165,11 @@ def test_a_wrong_argument_is_one_line_that_names_the_help_of_its_command(
     captured = capsys.readouterr()
     assert captured.err.startswith(f"body_tracking: {said}") and captured.err.endswith(f" (see {command} --help)\n")
     assert captured.err.count("\n") == 1 and not captured.out
+
+
+def test_a_folder_is_not_an_image(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["camera", "show", str(tmp_path), "-o", str(tmp_path / "people.png")]) == 2
+    assert capsys.readouterr().err == f"body_tracking: {tmp_path}: not an image\n"
 
 
 @pytest.mark.parametrize("given", ["tpose_wav", "tpose_wave", "bags/tpose_wvae", "bags/tpose_wave.bag"])

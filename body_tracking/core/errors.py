@@ -13,8 +13,8 @@ class BodyTrackingError(Exception):
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
     """``; did you mean 'x'?`` with the most similar known name; empty where none is similar."""
-    by_letters = {str(each).casefold(): str(each) for each in known}
-    similar = get_close_matches(str(name).casefold(), by_letters, n=1)
+    by_letters = {str(each).casefold().lstrip("-"): str(each) for each in known}
+    similar = get_close_matches(str(name).casefold().lstrip("-"), by_letters, n=1)
     return f"; did you mean {by_letters[similar[0]]!r}?" if similar else ""
 
 

@@ -99,7 +99,9 @@ def write_text(path: Path, text: str, error: type[BodyTrackingError] | None = No
         partial.write_text(text, encoding="utf-8")
         partial.replace(path)
     except OSError as reason:
-        said = f"cannot be written ({reason.strerror})"
+        # mkdir says that a file exists where a folder of the path should be
+        number = errno.ENOTDIR if isinstance(reason, FileExistsError) else reason.errno
+        said = f"cannot be written ({os.strerror(number or 0)})"
         raise FileError(said) if error is None else error(f"{path}: {said}") from reason
 
 

@@ -136,7 +136,7 @@ class InertialTracker:
         self._model = UpperBody()
         unknown = [name for name in segments if name not in self._model.segment_names]
         if unknown or not segments or len(set(segments)) < len(segments):
-            problem = f"unknown: {', '.join(unknown)}" if unknown else "none, or one twice"
+            problem = f"unknown: {', '.join(unknown)}" if unknown else "one twice" if segments else "none"
             expected = one_of(", ".join(unknown), self._model.segment_names)
             raise InertialTrackingError(f"segments with inertial sensors: {problem}; {expected}")
         self.segments = tuple(segments)

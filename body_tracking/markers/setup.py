@@ -33,7 +33,7 @@ def file_of(folder: object, name: str, made_by: str, else_do: str = "") -> Path:
         SetupError: no folder, or no such file in it.
     """
     if not folder:
-        raise SetupError("setup: no folder given; it has to hold rig.yaml, targets.yaml and chain.yaml")
+        raise SetupError(f"setup: no folder given; it has to hold {name}")
     path = Path(str(folder)).expanduser() / name
     if not path.is_file():
         raise SetupError(f"{path}: no such file; body_tracking markers {made_by} makes it{else_do}")

@@ -62,7 +62,8 @@ class Wand:
 
     def __post_init__(self) -> None:
         if len(self.places) < 2 or self.places[0] != 0.0 or not (np.diff(self.places) > 0.0).all():
-            raise WandError(f"balls at {self.places} m along the wand; expected two or more that rise from 0")
+            places = ", ".join(f"{place:g}" for place in self.places)
+            raise WandError(f"balls at {places} m along the wand; expected two or more that rise from 0")
         if not 0.0 < self.deviation < np.inf:
             raise WandError(f"deviation {self.deviation} m of the wand's length, expected a positive one")
 

@@ -67,11 +67,11 @@ def _model(args: argparse.Namespace) -> int:
 
 def _show(args: argparse.Namespace) -> int:
     if not args.image.is_file():  # OpenCV would print a line of its own
-        raise CameraCommandError(f"{args.image}: no such file")
+        raise CameraCommandError(f"{args.image}: {'not an image' if args.image.exists() else 'no such file'}")
     model = PoseModel(args.pose_model or model_files.default_folder())
     pixels: Any = cv2.imread(str(args.image), cv2.IMREAD_COLOR)
     if pixels is None:
-        raise CameraCommandError(f"{args.image}: no image")
+        raise CameraCommandError(f"{args.image}: not an image")
     image = np.ascontiguousarray(pixels[..., ::-1])
     found = people_in(image, model, max(args.people, 1))
     for each in found:

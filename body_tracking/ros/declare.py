@@ -35,6 +35,9 @@ def declare(node: Node, table: Sequence[Parameter]) -> Mapping[str, Value]:
     given = {name: item.value for name, item in overrides.items() if not is_ros_own(name)}
     for name in _of_other_nodes(node, given.keys() - known.keys()):
         del given[name]
+    for name in given.keys() & known.keys():
+        if given[name] is None and isinstance(known[name].default, tuple):
+            given[name] = ()  # rcl reads an empty list as no value
     values = check_all(table, given)
     for name, value in values.items():
         # rclpy would refuse an integer for a float; check_all has converted it.

@@ -13,7 +13,7 @@ import threading
 from typing import TYPE_CHECKING
 
 import rclpy
-from rclpy.exceptions import InvalidHandle
+from rclpy.exceptions import InvalidHandle, InvalidParameterTypeException
 from rclpy.executors import ExternalShutdownException
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.signals import SignalHandlerOptions
@@ -104,6 +104,7 @@ def run(node_class: type[GraphNode]) -> None:
         return  # a signal during the imports
     flags = {"-h", "--help"}
     if flags & set(sys.argv) and flags & set(remove_ros_args(sys.argv)[1:]):  # the latter reads parameters files
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # the reader may end, as `head` does
         print(usage(node_class))
         return
     code, node = 0, None
@@ -126,7 +127,7 @@ def run(node_class: type[GraphNode]) -> None:
     except BodyTrackingError as error:
         print(f"{node_class.NAME}: {error}", file=sys.stderr)
         code = 2
-    except RCLError as error:
+    except (RCLError, InvalidParameterTypeException) as error:  # the latter of use_sim_time, which rclpy declares
         if node is None:
             print(f"{node_class.NAME}: {' '.join(str(error).split())}", file=sys.stderr)
             code = 2

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -28,3 +30,8 @@ def test_help_ends_with_a_parameters_file_of_all_defaults(executable: str, tmp_p
     (values,) = read_file(tmp_path / "parameters.yaml").values()
     table = systems.parameters_of(executable)
     assert check_all(table, values) == {parameter.name: parameter.default for parameter in table}
+
+
+def test_help_without_a_reader_prints_no_traceback() -> None:
+    command = f"{sys.executable} -m body_tracking.nodes joint_angles --help | true"
+    assert subprocess.run(["bash", "-c", command], stderr=subprocess.PIPE, text=True, env=environment()).stderr == ""
