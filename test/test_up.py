@@ -358,7 +358,8 @@ def test_other_mistakes_on_the_command_line(capsys: pytest.CaptureFixture[str], 
     (tmp_path / "there").write_text("")
     assert "exists already" in refusal(capsys, "--bag", BAG, "--record", tmp_path / "there")
     assert "rate 0: expected" in refusal(capsys, "--bag", BAG, "--rate", "0")
-    assert "start 600: the bag lasts" in refusal(capsys, "--bag", BAG, "--start", "600")
+    for start in ("600", "-1"):
+        assert f"start {start}: expected 0 to" in refusal(capsys, "--bag", BAG, "--start", start)
     assert "loop: needs a bag" in refusal(capsys, "--loop")
     assert "people: needs --subject all" in refusal(capsys, "--bag", BAG, "--people", "2")
     assert "external" in refusal(capsys, "--bag", BAG, "--external")

@@ -263,9 +263,9 @@ def import_files(
             progress.at(sum(recording.progress for recording in recordings))
         progress.end()
         if not found:
-            raise ImportFileError(
-                f"{', '.join(map(str, files))}: no body in any frame, no inertial reading and no point"
-            )
+            text = f"{', '.join(map(str, files))}: no body in any frame, no inertial reading and no point"
+            counted = [f"{count} {problem}" for each in recordings for problem, count in each.problems.items()]
+            raise ImportFileError("; ".join([text, *counted, *(line for each in recordings for line in each.warnings)]))
         writer.close()
     except BaseException:
         writer.discard()

@@ -144,7 +144,7 @@ def options_for(args: argparse.Namespace, found: Mapping[str, Value] = MappingPr
             stated = with_covariances(reader)
             duration = (reader.end_ns - reader.start_ns) / NANOSECONDS
         if args.start and not 0.0 < args.start < duration:
-            raise UpError(f"start {args.start:g}: the bag lasts {duration:.1f} s")
+            raise UpError(f"start {args.start:g}: expected 0 to {duration:.1f}, the seconds of the bag")
         if not there and not names_sensors({**given, **_in_file(args.params_file)}):
             given |= found_sensors(types)
         if not options_of(**given)["computed"]:

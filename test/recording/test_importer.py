@@ -147,6 +147,13 @@ def test_times_of_receipt_that_are_all_the_same_get_a_warning(tmp_path):
     assert report.warnings == ["kinect1: 0 s from one message to the next, in the mean: are its times in seconds?"]
 
 
+def test_a_file_without_a_possible_reading_says_why(tmp_path):
+    axes = ",".join(f"angular_velocity_{axis}" for axis in "xyz")
+    (tmp_path / "imu.csv").write_text(f"stamp,{axes}\n0,0,0,300\n0.01,0,0,300\n")
+    with pytest.raises(BodyTrackingError, match=r"no inertial reading.*; 2 readings.*, line 2: .* 300 rad/s.*deg/s\?$"):
+        import_files([tmp_path / "imu.csv"], tmp_path / "bag")
+
+
 # --- the command
 
 
