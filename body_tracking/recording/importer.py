@@ -245,8 +245,10 @@ def import_files(
             path, messages = files[number], _messages(item)
             owner = TRUE_ANGLES if isinstance(item, RecordedAngles) else item.sensor
             if owners.setdefault(owner, path) != path:
-                what = owner if isinstance(item, RecordedAngles) else f"sensor {owner!r}"
-                hint = "" if isinstance(item, RecordedAngles) else f"; --sensor NAME={path} sets another name"
+                topic = setup.POINTS if isinstance(item, RecordedPoints) else TRUE_ANGLES
+                what = topic if isinstance(item, RecordedAngles | RecordedPoints) else f"sensor {owner!r}"
+                named = isinstance(recordings[number], MvnxRecording | TrajectoryRecording)
+                hint = "" if named else f"; --sensor NAME={path} sets another name"
                 raise ImportFileError(f"{what} is in {owners[owner]} and in {path}{hint}")
             for topic, type_name, qos, message in messages:
                 if topic not in topics:

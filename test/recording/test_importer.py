@@ -147,6 +147,17 @@ def test_times_of_receipt_that_are_all_the_same_get_a_warning(tmp_path):
     assert report.warnings == ["kinect1: 0 s from one message to the next, in the mean: are its times in seconds?"]
 
 
+def test_two_files_that_name_their_sensors_are_not_told_to_rename_them(shared_data, tmp_path):
+    pytest.importorskip("ezc3d", reason="ezc3d is not installed")
+    walk = shared_data / "marker_unlabelled" / "walkingOptiTrack.c3d"
+    suit = shared_data / "imu" / "xsens_upper_body" / "test_mocap.mvnx.gz"
+    for path, what in ((walk, "/markers/points"), (suit, "sensor 'pelvis'")):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+        with pytest.raises(BodyTrackingError) as refused:
+            import_files([path, tmp_path / path.name], tmp_path / "bag")
+        assert str(refused.value) == f"{what} is in {path} and in {tmp_path / path.name}"
+
+
 def test_a_file_without_a_possible_reading_says_why(tmp_path):
     axes = ",".join(f"angular_velocity_{axis}" for axis in "xyz")
     (tmp_path / "imu.csv").write_text(f"stamp,{axes}\n0,0,0,300\n0.01,0,0,300\n")
