@@ -138,7 +138,8 @@ def _topic(node: Listener, topic: str, kinds: Sequence[str], wanted: bool) -> It
 def stream(text: str, kind: str, came: Sequence[tuple[float, float, float]]) -> Finding:
     """Rate and stamps of received messages (:attr:`Listener.came`), compared with the least rate of their type."""
     if not came:
-        remedy = "is a person in view, the sensor on? Between containers: export FASTDDS_BUILTIN_TRANSPORTS=UDPv4"
+        remedy = "is a person in view, the sensor on, or a bag paused? Between containers: "
+        remedy += "export FASTDDS_BUILTIN_TRANSPORTS=UDPv4"
         return Finding(PROBLEM if kind == IMU else WARNING, f"{text}: nothing came", remedy)
     times, _, ages = zip(*came, strict=True)
     rate = (len(came) - 1) / max(times[-1] - times[0], 1e-3)

@@ -136,3 +136,7 @@ def test_a_client_library_that_ends_its_process_is_a_finding(domain: None, monke
     assert found.level == PROBLEM
     assert "rmw_cyclonedds_cpp" in found.found
     assert "unset RMW_IMPLEMENTATION" in found.remedy
+
+
+def test_where_nothing_comes_a_paused_bag_may_be_the_reason() -> None:
+    assert "a bag paused?" in live.stream("/kinect1/skeleton from /bag_player", POINT_CLOUD, []).remedy
