@@ -21,7 +21,15 @@ from body_tracking.core.measurement import BASE_STDDEV, COMMON_SHARE, joint_vari
 from body_tracking.core.parameters import number_field
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.sides import PAIRS
-from body_tracking.core.skeleton import N_JOINTS, NANOSECONDS, BoolArray, FloatArray, Skeleton
+from body_tracking.core.skeleton import (
+    BONES,
+    N_JOINTS,
+    NANOSECONDS,
+    BoolArray,
+    FloatArray,
+    Skeleton,
+    TrackingState,
+)
 from body_tracking.fusion.placement import WORLD, PlacedSensors, Placement
 from body_tracking.fusion.rhythm import Rhythm
 from body_tracking.fusion.sides import Sides
@@ -60,6 +68,7 @@ REACQUIRE = 0.3
 """... unless a sensor has reported it there for this long, seconds."""
 
 _DIAGONAL = np.arange(3)
+_FOREARMS = tuple((parent, child) for parent, child in BONES if parent.name.startswith(("ELBOW", "WRIST", "HAND")))
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +104,20 @@ class _Frame:
     angle: float
     body: int
     since_ns: int  # reference time of the first frame of its run, after a silence
+
+
+def _doubted(states: np.ndarray) -> np.ndarray:
+    """(25,) the states, where all beyond an inferred elbow is inferred, too.
+
+    A third of the joints that a Kinect does not see are said to be tracked, and those of one arm are hidden together.
+    """
+    if not (states == TrackingState.INFERRED).any():
+        return states
+    states = states.copy()
+    for parent, child in _FOREARMS:
+        if states[parent] == TrackingState.INFERRED:
+            states[child] = min(states[child], TrackingState.INFERRED)
+    return states
 
 
 class _Sensor(Placement):
@@ -232,7 +255,7 @@ class Fusion(PlacedSensors[_Sensor]):
             velocities = np.zeros((N_JOINTS, 3))
             since = stamp
         angle = viewing_angle(positions)
-        variance = joint_variance(positions, states, skeleton.covariances, angle)
+        variance = joint_variance(positions, _doubted(states), skeleton.covariances, angle)
         source.frames.append(
             _Frame(skeleton.stamp_ns, positions, velocities, variance, states, float(angle), skeleton.body, since)
         )
@@ -334,7 +357,7 @@ class Fusion(PlacedSensors[_Sensor]):
         body = frames[0].body
         if thesis:
             weights = thesis_text(states) if self.parameters.method == "thesis_text" else thesis_formula(states)
-            return self._combined(stamp, body, points, variance, weights, states)
+            return self._combined(stamp, body, points, variance, weights, weights, states)
         # Process noise between a sensor's capture and the output's.
         variance += np.array([[(0.5 * ACCELERATION * age**2) ** 2] for age in ages])
         angles = [frame.angle for frame in frames]
@@ -342,7 +365,7 @@ class Fusion(PlacedSensors[_Sensor]):
         weights = self._gated(stamp, names, points, variance, heading_agrees)
         if min(shares) < 1.0:
             weights *= np.array(shares)[:, None]
-        fused = self._combined(stamp, body, points, variance, weights, states)
+        fused = self._combined(stamp, body, points, variance, weights, 1.0 / variance, states)
         fused = self._sides.limit_turn_rate(stamp, fused, self.counters)
         self._follow(stamp, fused.positions)
         return fused
@@ -384,17 +407,26 @@ class Fusion(PlacedSensors[_Sensor]):
         self._rejecting = any(not np.isnan(since).all() for since in self._rejected_since.values())
 
     def _combined(
-        self, stamp: int, body: int, points: FloatArray, variance: FloatArray, weights: FloatArray, states: np.ndarray
+        self,
+        stamp: int,
+        body: int,
+        points: FloatArray,
+        variance: FloatArray,
+        weights: FloatArray,
+        seen: FloatArray,
+        states: np.ndarray,
     ) -> Skeleton:
         """The weighted mean (Schlagenhauf 2017, eq. 5.8, for any number of sensors).
 
-        Its covariance is the stated one, or the sensors' disagreement if larger.
+        Its covariance is the stated one, or the sensors' disagreement if larger, by the weights ``seen`` (k, 25) of all
+        that see the joint: where one is beyond the gate, either may be wrong.
         """
         used = weights > 0.0
         if not used.all():
-            used &= np.isfinite(points[..., 0])
-            weights = np.where(used, weights, 0.0)
-            points = np.where(used[..., None], points, 0.0)
+            finite = np.isfinite(points[..., 0])
+            used &= finite
+            weights, seen = np.where(used, weights, 0.0), np.where(finite, seen, 0.0)
+            points = np.where(finite[..., None], points, 0.0)
             variance = np.where(used, variance, 0.0)
             states = np.where(used, states, 0)
         total = weights.sum(axis=0)
@@ -405,7 +437,8 @@ class Fusion(PlacedSensors[_Sensor]):
         # what displaces a joint before all sensors alike does not average out
         common = np.where(used, np.minimum(variance, COMMON_SHARE * BASE_STDDEV**2), 0.0)
         claimed = np.einsum("kj,kj,kj->j", share, share, variance - common) + np.einsum("kj,kj->j", share, common)
-        covariance = np.einsum("kj,kji,kjl->jil", share, away, away)
+        odds = seen / np.maximum(seen.sum(axis=0), 1e-12)
+        covariance = np.einsum("kj,kji,kjl->jil", odds, away, away)
         # Add only the disagreement beyond the stated variance: along two sensors' difference the larger one results.
         spread = np.einsum("jii->j", covariance)
         covariance *= (np.maximum(spread - claimed, 0.0) / np.maximum(spread, 1e-12))[:, None, None]

@@ -19,7 +19,7 @@ from body_tracking.calibration.online import OnlineCalibration
 from body_tracking.core.clocks import ClockModel
 from body_tracking.core.measurement import COMMON_SHARE, left_right_axes
 from body_tracking.core.parameters import check_all
-from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from body_tracking.fusion.fusion import Fusion, FusionParameters
 from body_tracking.fusion.placement import FusionError
 from body_tracking.fusion.sides import HOLD, MIN_HOLD
@@ -377,6 +377,42 @@ def test_outliers_of_a_joint_are_gated_and_a_lasting_change_is_accepted() -> Non
     assert np.nanmax(np.abs(height[(stamps > 2.2) & (stamps < 4.0)])) < 0.05
     assert_allclose(height[stamps > 4.5], 0.8, atol=0.05)
     assert made.counters["gated_joints"] > 3
+
+
+def test_a_joint_that_one_sensor_sees_elsewhere_is_uncertain_until_they_agree() -> None:
+    """The gate follows the sensor that agrees with the past; nothing says that the past was right."""
+
+    def elsewhere(seen: Skeleton) -> Skeleton:
+        positions = seen.positions.copy()
+        if 2.0 < seen.stamp - OFFSET < 2.2:
+            positions[Joint.WRIST_RIGHT] += [0.0, -0.8, 0.0]
+        return replace(seen, positions=positions)
+
+    fused = run(fusion(), changed(frames(3.0), "kinect2", elsewhere))
+    stamps = np.array([each.stamp for each in fused])
+    upward = np.sqrt([each.covariances[Joint.WRIST_RIGHT, 2, 2] for each in fused if each.covariances is not None])
+    apart = (stamps > 2.05) & (stamps < 2.2)
+    assert errors(fused)[apart, Joint.WRIST_RIGHT].max() < 0.05
+    assert (1.96 * upward[apart] > 0.8).all()
+    assert upward[(stamps > 2.3) | (stamps < 2.0)].max() < 0.1
+
+
+def test_a_wrist_beyond_an_inferred_elbow_counts_as_inferred() -> None:
+    def raised(elbow: TrackingState) -> Callable[[Skeleton], Skeleton]:
+        def change(seen: Skeleton) -> Skeleton:
+            positions, states = seen.positions.copy(), seen.states.copy()
+            positions[Joint.WRIST_LEFT] += [0.0, -0.2, 0.0]
+            states[Joint.ELBOW_LEFT] = elbow
+            return replace(seen, positions=positions, states=states)
+
+        return change
+
+    tracked, inferred = (
+        errors(run(fusion(), changed(frames(2.0), "kinect1", raised(state))))[30:, Joint.WRIST_LEFT].mean()
+        for state in (TrackingState.TRACKED, TrackingState.INFERRED)
+    )
+    assert tracked > 0.05
+    assert inferred < 0.4 * tracked
 
 
 def test_late_repeated_and_backward_stamps() -> None:
