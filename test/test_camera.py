@@ -101,6 +101,7 @@ def test_camera_round_trip_through_its_message(model: str) -> None:
         ({"d": np.zeros(14)}, "14 coefficients"),
         ({"d": np.array([np.nan])}, "finite"),
         ({"binning_x": 2}, "binned"),
+        ({"width": 2**32 - 1, "height": 2**32 - 1}, "4294967295 x 4294967295 pixels"),
         ({"width": 0}, "0 x 424 pixels"),
     ],
 )

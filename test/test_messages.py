@@ -23,6 +23,7 @@ from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.angles import angles_to_joint_states, joint_state_values, joint_states_to_angles
 from body_tracking.messages.base import MessageError, MessageTypes
 from body_tracking.messages.cdr import encode_skeletons
+from body_tracking.messages.clouds import POSITION, make_cloud, read_cloud, record_of
 from body_tracking.messages.codecs import Skeletons
 from body_tracking.messages.diagnostics import diagnostics, statuses
 from body_tracking.messages.imus import message_to_magnetic_field, message_to_sample, sample_to_messages
@@ -98,6 +99,14 @@ ANGLES = JointAngles(
     np.array([0.05, np.inf]),
     np.array([0.3, 0.4]),
 )
+
+
+def test_an_empty_cloud_of_a_point_step_beyond_all_records_is_refused() -> None:
+    cloud = make_cloud(np.empty(0, record_of(POSITION)), POSITION, 1, "camera", BAG_MESSAGES)
+    assert len(read_cloud(cloud, dict(POSITION), ["x"], 10)) == 0
+    cloud.point_step = 2**32 - 1
+    with pytest.raises(MessageError, match="point_step 4294967295 of 0 bytes"):
+        read_cloud(cloud, dict(POSITION), ["x"], 10)
 
 
 def test_angles_round_trip(types: MessageTypes) -> None:

@@ -11,6 +11,9 @@ from body_tracking.messages.base import MessageError, MessageTypes, to_header
 
 CAMERA_INFO: Final = "sensor_msgs/msg/CameraInfo"
 
+_MOST_PIXELS: Final = 4096 * 4096
+"""More than any camera with a depth sensor has; the receiver keeps a table of all pixels."""
+
 
 def camera_to_info(camera: Camera, stamp_ns: int, types: MessageTypes) -> Any:
     """``sensor_msgs/CameraInfo`` of a full, unrectified image."""
@@ -36,9 +39,13 @@ def info_to_camera(message: Any) -> Camera:
     """The camera in a ``sensor_msgs/CameraInfo``; missing coefficients of ``plumb_bob`` are zero.
 
     Raises:
-        MessageError: not calibrated (zero focal lengths), another distortion model, a binned or cropped image.
+        MessageError: not calibrated (zero focal lengths), another distortion model, a binned or cropped image, or one
+            of more pixels than any camera has.
     """
     frame_id = message.header.frame_id
+    if message.width * message.height > _MOST_PIXELS:
+        size = f"{message.width} x {message.height}"
+        raise MessageError(f"camera {frame_id}: {size} pixels, expected at most {_MOST_PIXELS}")
     if message.binning_x > 1 or message.binning_y > 1 or message.roi.x_offset or message.roi.y_offset:
         raise MessageError(f"camera {frame_id}: a binned or cut image; its matrix is of the whole one")
     model, given = str(message.distortion_model) or "plumb_bob", np.asarray(message.d, dtype=np.float64)

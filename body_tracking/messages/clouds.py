@@ -21,6 +21,8 @@ Fields: TypeAlias = tuple[tuple[str, int], ...]
 POSITION: Final[Fields] = (("x", FLOAT32), ("y", FLOAT32), ("z", FLOAT32))
 COVARIANCE: Final[Fields] = tuple((name, FLOAT32) for name in ("xx", "xy", "xz", "yy", "yz", "zz"))
 _UPPER = np.triu_indices(3)
+_LARGEST_STEP: Final = 2**31 - 1
+"""Bytes of numpy's largest record: an empty cloud may state more."""
 
 
 @cache
@@ -81,7 +83,7 @@ def _described(cloud: Any, wanted: Mapping[str, int], needed: Sequence[str]) -> 
     """The numpy record that the message's own field table describes."""
     found: dict[str, tuple[str, int]] = {}
     step = int(cloud.point_step)
-    if step > len(cloud.data) and len(cloud.data):
+    if step > (len(cloud.data) or _LARGEST_STEP):
         raise MessageError(f"point_step {step} of {len(cloud.data)} bytes of data")
     for field in cloud.fields:
         if field.name not in wanted or field.name in found:
