@@ -128,6 +128,9 @@ class RobotCommands(GraphNode):
             self.monitor.totals["unpaired"] += 1
 
     def on_skeletons(self, sensor: str, skeletons: tuple[Skeleton, ...], sent_ns: int) -> None:
+        topic = self.full_name(graph.skeleton_topic(sensor))
+        if self.has_switched(topic):  # the angles may be of two people in turn
+            self.follower.refuse_angles(f"{topic}: frames {_SWITCHED}")
         self.follower.receive_frame(sensor, skeletons[0].stamp_ns, time.monotonic_ns())
 
     def on_calibration(self, message: TransformStamped, sent_ns: int) -> None:

@@ -47,6 +47,7 @@ ROBOTS = {
     "unknown": False,
     "angles": True,
     "twin": True,
+    "frames": True,
 }
 
 
@@ -171,11 +172,15 @@ class Bench:
         self.node = BenchNode("bench")
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.node)
-        self.frames = self.node.create_publisher(PointCloud2, graph.skeleton_topic("kinect1"), 10)
+        self.frames = [self.publisher_of_frames()]
         self.node.create_timer(1.0 / 30.0, self._tell)
         self.running: dict[RobotCommands, tuple[LeanExecutor, threading.Thread]] = {}
         self._robots = {name: Robot(self, name, self.start(name)) for name in ROBOTS}
         self._active: Robot | None = None
+
+    def publisher_of_frames(self) -> Any:
+        """A publisher of the sensor's frames."""
+        return self.node.create_publisher(PointCloud2, graph.skeleton_topic("kinect1"), 10)
 
     def robot(self, name: str) -> Robot:
         """A robot that receives angles from now on, instead of the one before, whose node ends."""
@@ -204,7 +209,8 @@ class Bench:
     def _tell(self) -> None:
         now_ns = time.time_ns()
         body = Skeleton(now_ns, "kinect1_optical_frame", np.ones((25, 3)), np.full(25, 2, np.uint8))
-        self.frames.publish(encode_skeletons([body]))
+        for publisher in self.frames:
+            publisher.publish(encode_skeletons([body]))
         if self._active is not None:
             self._active.publish(now_ns)
 
@@ -314,6 +320,18 @@ def test_angles_of_two_alternating_publishers_are_refused(bench: Bench) -> None:
     assert any(robot.is_told_nothing() for _ in range(4))
     assert min(robot.commands) > -0.1  # and the other one was never followed
     robot.doubled = False
+    robot.until_it_follows()
+
+
+def test_angles_are_not_followed_while_two_sensors_publish_on_one_topic(bench: Bench) -> None:
+    robot = bench.robot("frames")
+    robot.until_it_follows()
+    second = bench.publisher_of_frames()
+    bench.frames.append(second)
+    robot.until_it_says("stopped", "/kinect1/skeleton: frames of another publisher than before")
+    assert any(robot.is_told_nothing() for _ in range(4))  # a busy machine may deliver only those of one for a while
+    bench.frames.remove(second)
+    bench.node.destroy_publisher(second)
     robot.until_it_follows()
 
 
