@@ -27,6 +27,8 @@ class Elbow(Node):
         angles = self.angles.pop((stddev.header.stamp.sec, stddev.header.stamp.nanosec), None)
         if angles is None or "elbow_flexion_left_body1" not in angles.name:
             return
+        if stddev.name != angles.name or not len(angles.name) == len(angles.position) == len(stddev.position):
+            return  # malformed: no message may end a controller
         i = angles.name.index("elbow_flexion_left_body1")
         if stddev.position[i] < 0.35:  # false for infinity and NaN
             print(f"{angles.position[i]:.2f} +- {stddev.position[i]:.2f} rad", flush=True)

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 from threading import Timer
+from typing import Any
 
 import pytest
 
@@ -41,6 +42,21 @@ def test_the_elbow_says_what_it_waits_for() -> None:
             killer.cancel()
             elbow.terminate()
     assert said.startswith("elbow: waits for /humans/bodies/body1/joint_states and ")
+
+
+def test_malformed_angles_do_not_end_the_elbow(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("rclpy")
+    from sensor_msgs.msg import JointState
+
+    names: dict[str, Any] = {}
+    exec((ROOT / "examples" / "elbow.py").read_text().partition("\ntry:")[0], names)
+    elbow = names["Elbow"].__new__(names["Elbow"])
+    elbow.angles = {}
+    name = ["other", "elbow_flexion_left_body1"]
+    for positions, deviations in (([], [0.1, 0.1]), ([0.0, 1.0], [0.1]), ([0.0, 1.0], [0.1, 0.1])):
+        elbow.on_angles(JointState(name=name, position=positions))
+        elbow.on_stddev(JointState(name=name, position=deviations))
+    assert capsys.readouterr().out == "1.00 +- 0.10 rad\n"
 
 
 def test_options_of_a_recording_need_one() -> None:

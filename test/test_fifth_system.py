@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from body_tracking.core.skeleton import Joint
-from body_tracking.messages.base import to_nanoseconds
+from body_tracking.messages.base import MessageError, to_nanoseconds
 from body_tracking.messages.cdr import decode_skeletons
+from body_tracking.messages.images import array_to_image
 from body_tracking.pipeline import graph
-from body_tracking.recording.rosbag2 import BagReader, deserialize
+from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, BagReader, deserialize
 from domains import domain
 
 pytest.importorskip("rclpy", reason="ROS is not installed")
@@ -84,6 +85,18 @@ def test_its_topic_parameter_option_and_layer_are_among_the_graphs() -> None:
     assert "heights:" in parameters
     assert HEIGHT in names and names.endswith("['heights']")
     assert "--height-margin METRES" in options
+
+
+def test_an_image_that_is_no_height_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "examples" / "fifth_system"))
+    from heights.stage import Height
+
+    assert Height().decode(Height().encode((5, 1.75), BAG_WIRE), BAG_WIRE) == (5, 1.75)
+    for wrong in (np.zeros((1, 1), np.uint8), np.zeros((2, 1), np.float32)):
+        encoding = "32FC1" if wrong.dtype == np.float32 else ""
+        image = array_to_image(wrong, 5, "world", BAG_MESSAGES, encoding)
+        with pytest.raises(MessageError, match="expected"):
+            Height().decode(BAG_WIRE.serialize("sensor_msgs/msg/Image", image), BAG_WIRE)
 
 
 def test_a_broken_system_is_named_and_left_out(tmp_path: Path) -> None:

@@ -264,15 +264,19 @@ class OnlineCalibration:
         sensors: their names.
         parameters: see :class:`CalibrationParameters`.
         reference: the sensor that defines ``world`` and its time; the first one when None.
+
+    Raises:
+        CalibrationError: the reference is not among the sensors, or there are none.
     """
 
     def __init__(
         self, sensors: Sequence[str], parameters: CalibrationParameters | None = None, reference: str | None = None
     ) -> None:
         self.parameters = parameters or CalibrationParameters()
-        self.reference = reference or sensors[0]
+        self.reference = reference or next(iter(sensors), "")
         if self.reference not in sensors:
-            raise CalibrationError(f"reference sensor {self.reference!r} is not among {', '.join(sensors)}")
+            listed = ", ".join(sensors) or "(none)"
+            raise CalibrationError(f"reference sensor {self.reference!r} is not among the sensors {listed}")
         self.events: list[str] = []
         self._base = level_pose(
             self.reference,

@@ -105,7 +105,8 @@ class PlacedSensors(Generic[S]):
         """
         self.reference = reference or (sensors[0] if sensors else "")
         if self.reference not in sensors:
-            raise FusionError(f"reference sensor {self.reference!r} is not among the sensors {', '.join(sensors)}")
+            listed = ", ".join(sensors) or "(none)"
+            raise FusionError(f"reference sensor {self.reference!r} is not among the sensors {listed}")
         self.counters: Counter[str] = Counter()
         self._sensors: dict[str, S] = {name: kind() for name in sensors}
 

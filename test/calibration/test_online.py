@@ -111,6 +111,11 @@ def test_a_known_motion_and_clock_are_recovered(shared_data: Path, name: str, of
         assert abs(moved.clocks["kinect2"].to_sensor(at) - before) < 0.005 * NANOSECONDS
 
 
+def test_a_calibration_without_sensors_is_refused() -> None:
+    with pytest.raises(CalibrationError, match=r"reference sensor '' is not among the sensors \(none\)"):
+        OnlineCalibration(())
+
+
 def test_published_poses_never_jump(shared_data: Path) -> None:
     """No update moves a joint near the person by more than the slew rates allow, whatever the estimate does."""
     _, updates = run(recording(shared_data / "kinect_pairs" / "p12_90deg.csv.gz")[: draws(1700, 10_000)])

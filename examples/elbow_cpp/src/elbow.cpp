@@ -49,10 +49,14 @@ private:
     }
     const JointState::ConstSharedPtr angles = found->second;
     waiting_.erase(found);
-    for (std::size_t i = 0; i < angles->name.size(); ++i) {
+    const std::size_t count = angles->name.size();
+    if (stddev.name != angles->name || angles->position.size() != count || stddev.position.size() != count) {
+      return;  // malformed: no message may end a controller
+    }
+    for (std::size_t i = 0; i < count; ++i) {
       // false for infinity and NaN: then there is no estimate
-      if (angles->name[i] == "elbow_flexion_left_body1" && stddev.position.at(i) < 0.35) {
-        std::printf("%.2f +- %.2f rad\n", angles->position.at(i), stddev.position.at(i));
+      if (angles->name[i] == "elbow_flexion_left_body1" && stddev.position[i] < 0.35) {
+        std::printf("%.2f +- %.2f rad\n", angles->position[i], stddev.position[i]);
         std::fflush(stdout);
       }
     }

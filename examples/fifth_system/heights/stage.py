@@ -11,8 +11,9 @@ from body_tracking.core.message_types import IMAGE
 from body_tracking.core.parameters import Parameter, Value
 from body_tracking.core.qos import RELIABLE as RELIABLE_QOS
 from body_tracking.core.skeleton import Joint
-from body_tracking.messages.base import to_header, to_nanoseconds
+from body_tracking.messages.base import MessageError
 from body_tracking.messages.codecs import Codec, Wire
+from body_tracking.messages.images import array_to_image, image_to_array
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.shared import RELIABLE, skeleton_input
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
@@ -25,21 +26,14 @@ class Height(Codec):
     type_name = IMAGE
 
     def encode(self, payload: tuple[int, float], wire: Wire) -> bytes:
-        message = wire.types.make(
-            IMAGE,
-            header=to_header(payload[0], "world", wire.types),
-            height=1,
-            width=1,
-            encoding="32FC1",
-            is_bigendian=0,
-            step=4,
-            data=wire.types.octets(np.float32(payload[1]).tobytes()),
-        )
-        return wire.serialize(IMAGE, message)
+        pixels = np.array([[payload[1]]], np.float32)
+        return wire.serialize(IMAGE, array_to_image(pixels, payload[0], "world", wire.types, "32FC1"))
 
     def decode(self, cdr: bytes, wire: Wire) -> tuple[int, float]:
-        message = wire.deserialize(IMAGE, cdr)
-        return to_nanoseconds(message.header.stamp), float(np.frombuffer(bytes(message.data), np.float32)[0])
+        stamp_ns, _, pixels = image_to_array(wire.deserialize(IMAGE, cdr), {"32FC1": "f4"})
+        if pixels.shape != (1, 1):
+            raise MessageError(f"an image of {pixels.shape}, expected one number")
+        return stamp_ns, float(pixels[0, 0])
 
 
 class HeightStage(Stage):
@@ -55,7 +49,7 @@ class HeightStage(Stage):
 
     def take(self, topic: str, payload: Any, now: Now) -> Iterable[Output]:
         up = payload[0].positions[:, 2]
-        if not np.isfinite(up[[Joint.FOOT_LEFT, Joint.FOOT_RIGHT]]).any():
-            return  # of a filter without legs
+        if not (np.isfinite(up[Joint.HEAD]) and np.isfinite(up[[Joint.FOOT_LEFT, Joint.FOOT_RIGHT]]).any()):
+            return  # of a filter without legs, or of somebody whose head is not seen
         height = float(up[Joint.HEAD] - np.nanmin(up)) + float(str(self.values["margin"]))
         yield Output(HEIGHT, (payload[0].stamp_ns, height), payload[0].stamp_ns)
