@@ -240,7 +240,13 @@ class BagRecorder(GraphNode):
             return
         for topic, types in self.get_topic_names_and_types():
             if self.wanted(topic):
-                self.adapt(topic, types[0])
+                known = self.inputs.get(topic)
+                kept = known.type_name if known is not None and known.type_name in types else types[0]
+                self.adapt(topic, kept)
+                others = ", ".join(each for each in types if each != kept)
+                if others and self.refused.get(topic) != others:
+                    self.refused[topic] = others
+                    self.get_logger().warning(f"{topic} is recorded as {kept}, not as {others}")
 
     def wanted(self, topic: str) -> bool:
         """Whether the topic of this full name is to be recorded."""

@@ -6,6 +6,8 @@ import itertools
 import os
 import shutil
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from datetime import datetime
@@ -413,6 +415,32 @@ def test_unknown_message_type_is_counted_and_other_topics_recorded(bench, tmp_pa
     bench.wait_until(named, "a diagnostic that names /goals")
     bench.wait_until(lambda: len(of_topic(read_so_far(tmp_path / "bag"), "/talk")) > 10, "the other topic")
     bench.finished(recorder, signal.SIGINT)
+
+
+def test_messages_of_a_second_type_are_named_and_those_of_the_first_are_recorded_on(bench, tmp_path):
+    bench.publish(50.0, lambda: "still here", "/talk")
+    recorder = bench.start("bag_recorder", folder=tmp_path / "bag", topics=["/talk"], chunk_seconds=0.1)
+    bench.wait_until(lambda: bench.said("bag_recorder").get("topics") == "1", "the topic")
+    # DDS refuses a second type within one process
+    script = (
+        "import rclpy; from std_msgs.msg import Bool; from rclpy.qos import qos_profile_sensor_data as qos; "
+        "rclpy.init(); node = rclpy.create_node('other'); node.create_publisher(Bool, '/talk', qos); rclpy.spin(node)"
+    )
+    with subprocess.Popen([sys.executable, "-c", script], env=bench.environment) as other:
+        try:
+            bench.wait_until(
+                lambda: bench.said("bag_recorder").get("refused") == "/talk (std_msgs/msg/Bool)", "its second type"
+            )
+            bench.until(lambda: False, 2.0)  # the recorder looks for topics again
+            count = len(of_topic(read_so_far(tmp_path / "bag"), "/talk"))
+            bench.wait_until(
+                lambda: len(of_topic(read_so_far(tmp_path / "bag"), "/talk")) > count + 20, "more of the first type"
+            )
+        finally:
+            other.kill()
+    assert "/talk is recorded as std_msgs/msg/String, not as std_msgs/msg/Bool" in bench.finished(
+        recorder, signal.SIGINT
+    )
 
 
 def test_full_disk_is_reported_without_a_crash(bench, tmp_path):
