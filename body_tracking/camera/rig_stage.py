@@ -73,7 +73,7 @@ class RigStage(Stage):
         name = self._by_topic[topic]
         self._problems.pop(name, None)
         try:
-            check_size(pixels[..., 0], self._cameras[name])
+            check_size(pixels[..., 0], self._cameras[name], "colour")
         except DepthError as error:
             self._counters[f"{name} images of another size"] += 1
             self._problems[name] = str(error)

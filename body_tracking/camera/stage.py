@@ -227,7 +227,7 @@ class CameraStage(Stage):
         images: dict[str, NDArray[Any]] = {_COLOUR: colour[..., 0], _DEPTH: depth}
         for what, image in images.items():
             try:
-                check_size(image, self._infos[what])
+                check_size(image, self._infos[what], what)
             except DepthError as error:
                 self._counters[f"{what} images of another size"] += 1
                 self._problem = str(error)

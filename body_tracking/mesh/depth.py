@@ -71,16 +71,16 @@ class Cloud:
     pixels: IntArray
 
 
-def check_size(depth: NDArray[Any], camera: Camera) -> None:
-    """Check that an image has the size of a calibrated camera.
+def check_size(image: NDArray[Any], camera: Camera, kind: str = "depth") -> None:
+    """Check that a (height, width) image of this kind has the size of a calibrated camera.
 
     Raises:
         DepthError: another size.
     """
-    height, width = depth.shape
+    height, width = image.shape
     if (width, height) != (camera.width, camera.height):
         raise DepthError(
-            f"depth image of {width} x {height} pixels, but camera_info of {camera.frame_id} says "
+            f"{kind} image of {width} x {height} pixels, but the calibration of {camera.frame_id} says "
             f"{camera.width} x {camera.height}"
         )
 

@@ -196,7 +196,7 @@ def test_images_of_another_size_are_named_and_a_covered_lens() -> None:
     node, recorded = calibrated(), recording()
     stamps = list(recorded.colour)
     colour, depth = recorded.colour[stamps[0]], recorded.depth[stamps[0]]
-    with pytest.raises(DepthError, match="240 x 180"):
+    with pytest.raises(DepthError, match=r"^colour image of 240 x 180"):
         show(node, stamps[0], colour[::2, ::2], depth)
     assert node.counters["colour images of another size"] == 1
     assert show(node, stamps[1], colour, np.zeros_like(depth)) == []

@@ -42,7 +42,7 @@ def test_points_project_onto_their_pixels_with_distortion() -> None:
 
 def test_image_of_another_size_is_named() -> None:
     view = DepthCamera(camera())
-    with pytest.raises(DepthError, match="64 x 53 pixels, but camera_info of kinect1_optical_frame says 128 x 106"):
+    with pytest.raises(DepthError, match="64 x 53 pixels, but the calibration of kinect1_optical_frame says 128 x 106"):
         view.points(np.ones((53, 64), np.float32))
     with pytest.raises(DepthError, match="mask"):
         view.sample(np.ones((106, 128), np.float32), np.ones((53, 64), bool), 10)
