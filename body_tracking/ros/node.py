@@ -434,7 +434,7 @@ class GraphNode(BatchNode):
 
     def is_stale(self, topic: str, sent_ns: int) -> bool:
         """Whether a frame was sent before a standstill of this process and is too old; never with ``reliable``."""
-        return not self.values["reliable"] and self.standstill.is_stale(topic, sent_ns, time.time_ns())
+        return not self.values.get("reliable") and self.standstill.is_stale(topic, sent_ns, time.time_ns())
 
     def drop_late(self, messages: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
         """The messages without the late frames of a node that is too slow; called by the executor."""

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="ROS is not installed")
 
 from running import ROOT, Running
+from sensor_msgs.msg import Image
 
 from body_tracking.messages.cdr import decode_skeletons
+from body_tracking.messages.images import array_to_image
 from body_tracking.pipeline import graph
 from body_tracking.recording.rosbag2 import BagReader
+from body_tracking.ros.wire import ROS
 from excerpts import beginning
 from pose_networks import MISSING, REASON
 from test_up import Up
@@ -61,3 +65,23 @@ def test_a_driver_that_does_not_run_is_reported_with_the_topics_that_are_missing
         assert running.until(lambda: running.said(node).get("level") == "1", timeout=60.0)
     text = running.said(node)[""]
     assert text.startswith("nothing arrives on ") and topic in text
+
+
+def test_images_of_drivers_become_sets_with_equal_stamps(tmp_path: Path) -> None:
+    setup = ROOT / "config" / "marker_setup"
+    with Running(tmp_path) as running:
+        running.start("marker_cameras", setup=setup, images="/first/image,/second/image")
+        images = running.collect(Image, "/right/image_raw")
+        publishers = [running.node.create_publisher(Image, f"/{name}/image", 10) for name in ("first", "second")]
+
+        def publish() -> None:
+            for publisher in publishers:
+                stamp_ns = running.node.get_clock().now().nanoseconds // 100_000_000 * 100_000_000
+                publisher.publish(array_to_image(np.zeros((480, 640), np.uint8), stamp_ns, "driver", ROS))
+
+        running.node.create_timer(0.1, publish)
+        assert running.until(lambda: len(images) > 3, 30.0), (
+            running.said("marker_cameras"),
+            running.log("marker_cameras"),
+        )
+    assert images[0].header.frame_id == "right_optical_frame"
