@@ -157,7 +157,7 @@ class PointTopicStage(Stage):
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
         """Warn as long as no message has arrived."""
         if not self._frames:
-            return 1, f"no message on {self.values['topic']} yet", {}
+            return 1, f"no usable message on {self.values['topic']} yet", {}
         return 0, "", {}
 
     @property

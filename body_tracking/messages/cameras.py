@@ -11,8 +11,8 @@ from body_tracking.messages.base import MessageError, MessageTypes, to_header
 
 CAMERA_INFO: Final = "sensor_msgs/msg/CameraInfo"
 
-_MOST_PIXELS: Final = 4096 * 4096
-"""More than any camera with a depth sensor has; the receiver keeps a table of all pixels."""
+_MOST_PIXELS: Final = 8192 * 4096
+"""Cameras of motion capture have up to 26 million; a receiver may keep a table of all pixels."""
 
 
 def camera_to_info(camera: Camera, stamp_ns: int, types: MessageTypes) -> Any:

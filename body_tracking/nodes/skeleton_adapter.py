@@ -78,9 +78,11 @@ class SkeletonAdapter(GraphNode):
 
     def state(self) -> tuple[int, str, dict[str, object]]:
         if self.last_received is None:
-            return 1, f"no message on {self.topic} yet", {}
+            return 1, f"no usable message on {self.topic} yet", {}
         silent = time.monotonic() - self.last_received
-        return (1, f"no message on {self.topic} for {silent:.0f} s", {}) if silent > SILENCE else (0, "streaming", {})
+        if silent > SILENCE:
+            return 1, f"no usable message on {self.topic} for {silent:.0f} s", {}
+        return 0, "streaming", {}
 
 
 main = partial(run, SkeletonAdapter)
