@@ -100,8 +100,8 @@ class CalibrationStage(Stage):
         """Frames in a row with an impossible trunk, and its last length, metres."""
         self._frames: dict[str, str] = {}
         """The frame of each sensor's last skeletons."""
-        self._several: set[str] = set()
-        """The sensors with several people in their last frame."""
+        self._people: dict[str, int] = {}
+        """The number of people in each sensor's last frame."""
         self._sensors = {graph.skeleton_topic(sensor): sensor for sensor in sensors}
         self.inputs = tuple(skeleton_input(topic, values) for topic in self._sensors)
         world = str(values["world_frame"])
@@ -131,7 +131,7 @@ class CalibrationStage(Stage):
             self._check_size(sensor, skeleton)
             self._frames[sensor] = skeleton.frame_id
             self._check_time(skeleton)
-        (self._several.add if len(payload) > 1 else self._several.discard)(sensor)
+        self._people[sensor] = len(payload)
         subject = self._subjects[sensor].pick(payload)
         if subject is None or self._repeats[sensor].add(subject.stamp_ns, subject.positions):
             return ()
@@ -183,8 +183,9 @@ class CalibrationStage(Stage):
 
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
         level, text, values = self.calibration.status()
-        if level and self._several:
-            text += f"; {SEVERAL} of {', '.join(sorted(self._several))}"
+        several = [sensor for sensor, people in self._people.items() if people > 1]
+        if level and several:
+            text += f"; {SEVERAL} of {', '.join(sorted(several))}"
         if self._exists and self.values["save"] and self._recorded >= _ODD_FRAMES:
             text += (
                 f"; {self._file} is not written, as the stamps are those of a recording: {self._recorded_s:.0f} s "

@@ -21,15 +21,7 @@ from body_tracking.core.measurement import BASE_STDDEV, COMMON_SHARE, joint_vari
 from body_tracking.core.parameters import number_field
 from body_tracking.core.sensor_poses import SensorPose
 from body_tracking.core.sides import PAIRS
-from body_tracking.core.skeleton import (
-    BONES,
-    N_JOINTS,
-    NANOSECONDS,
-    BoolArray,
-    FloatArray,
-    Skeleton,
-    TrackingState,
-)
+from body_tracking.core.skeleton import BONES, N_JOINTS, NANOSECONDS, BoolArray, FloatArray, Skeleton, TrackingState
 from body_tracking.fusion.placement import WORLD, PlacedSensors, Placement
 from body_tracking.fusion.rhythm import Rhythm
 from body_tracking.fusion.sides import Sides
@@ -106,10 +98,10 @@ class _Frame:
     since_ns: int  # reference time of the first frame of its run, after a silence
 
 
-def _doubted(states: np.ndarray) -> np.ndarray:
-    """(25,) the states, where all beyond an inferred elbow is inferred, too.
+def _with_hidden_forearms(states: np.ndarray) -> np.ndarray:
+    """(25,) the states, with all joints beyond an inferred elbow inferred, too.
 
-    A third of the joints that a Kinect does not see are said to be tracked, and those of one arm are hidden together.
+    The joints of one arm are hidden together, and a Kinect calls some hidden ones tracked (in the simulator a third).
     """
     if not (states == TrackingState.INFERRED).any():
         return states
@@ -255,7 +247,7 @@ class Fusion(PlacedSensors[_Sensor]):
             velocities = np.zeros((N_JOINTS, 3))
             since = stamp
         angle = viewing_angle(positions)
-        variance = joint_variance(positions, _doubted(states), skeleton.covariances, angle)
+        variance = joint_variance(positions, _with_hidden_forearms(states), skeleton.covariances, angle)
         source.frames.append(
             _Frame(skeleton.stamp_ns, positions, velocities, variance, states, float(angle), skeleton.body, since)
         )
