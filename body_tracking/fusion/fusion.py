@@ -99,7 +99,7 @@ class _Frame:
 
 
 def _with_hidden_forearms(states: np.ndarray) -> np.ndarray:
-    """(25,) the states, with all joints beyond an inferred elbow inferred, too.
+    """(25,) the states, with the joints beyond an inferred elbow, wrist or hand inferred, too.
 
     The joints of one arm are hidden together, and a Kinect calls some hidden ones tracked (in the simulator a third).
     """
@@ -349,7 +349,7 @@ class Fusion(PlacedSensors[_Sensor]):
         body = frames[0].body
         if thesis:
             weights = thesis_text(states) if self.parameters.method == "thesis_text" else thesis_formula(states)
-            return self._combined(stamp, body, points, variance, weights, weights, states)
+            return self._combined(stamp, body, points, variance, weights, states)
         # Process noise between a sensor's capture and the output's.
         variance += np.array([[(0.5 * ACCELERATION * age**2) ** 2] for age in ages])
         angles = [frame.angle for frame in frames]
@@ -357,7 +357,7 @@ class Fusion(PlacedSensors[_Sensor]):
         weights = self._gated(stamp, names, points, variance, heading_agrees)
         if min(shares) < 1.0:
             weights *= np.array(shares)[:, None]
-        fused = self._combined(stamp, body, points, variance, weights, 1.0 / variance, states)
+        fused = self._combined(stamp, body, points, variance, weights, states)
         fused = self._sides.limit_turn_rate(stamp, fused, self.counters)
         self._follow(stamp, fused.positions)
         return fused
@@ -399,26 +399,17 @@ class Fusion(PlacedSensors[_Sensor]):
         self._rejecting = any(not np.isnan(since).all() for since in self._rejected_since.values())
 
     def _combined(
-        self,
-        stamp: int,
-        body: int,
-        points: FloatArray,
-        variance: FloatArray,
-        weights: FloatArray,
-        seen: FloatArray,
-        states: np.ndarray,
+        self, stamp: int, body: int, points: FloatArray, variance: FloatArray, weights: FloatArray, states: np.ndarray
     ) -> Skeleton:
         """The weighted mean (Schlagenhauf 2017, eq. 5.8, for any number of sensors).
 
-        Its covariance is the stated one, or the sensors' disagreement if larger, by the weights ``seen`` (k, 25) of all
-        that see the joint: where one is beyond the gate, either may be wrong.
+        Its covariance is the stated one, or the sensors' disagreement if larger.
         """
         used = weights > 0.0
         if not used.all():
-            finite = np.isfinite(points[..., 0])
-            used &= finite
-            weights, seen = np.where(used, weights, 0.0), np.where(finite, seen, 0.0)
-            points = np.where(finite[..., None], points, 0.0)
+            used &= np.isfinite(points[..., 0])
+            weights = np.where(used, weights, 0.0)
+            points = np.where(used[..., None], points, 0.0)
             variance = np.where(used, variance, 0.0)
             states = np.where(used, states, 0)
         total = weights.sum(axis=0)
@@ -429,8 +420,7 @@ class Fusion(PlacedSensors[_Sensor]):
         # what displaces a joint before all sensors alike does not average out
         common = np.where(used, np.minimum(variance, COMMON_SHARE * BASE_STDDEV**2), 0.0)
         claimed = np.einsum("kj,kj,kj->j", share, share, variance - common) + np.einsum("kj,kj->j", share, common)
-        odds = seen / np.maximum(seen.sum(axis=0), 1e-12)
-        covariance = np.einsum("kj,kji,kjl->jil", odds, away, away)
+        covariance = np.einsum("kj,kji,kjl->jil", share, away, away)
         # Add only the disagreement beyond the stated variance: along two sensors' difference the larger one results.
         spread = np.einsum("jii->j", covariance)
         covariance *= (np.maximum(spread - claimed, 0.0) / np.maximum(spread, 1e-12))[:, None, None]

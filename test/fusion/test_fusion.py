@@ -379,24 +379,6 @@ def test_outliers_of_a_joint_are_gated_and_a_lasting_change_is_accepted() -> Non
     assert made.counters["gated_joints"] > 3
 
 
-def test_a_joint_that_one_sensor_sees_elsewhere_is_uncertain_until_they_agree() -> None:
-    """The gate follows the sensor that agrees with the past; nothing says that the past was right."""
-
-    def elsewhere(seen: Skeleton) -> Skeleton:
-        positions = seen.positions.copy()
-        if 2.0 < seen.stamp - OFFSET < 2.2:
-            positions[Joint.WRIST_RIGHT] += [0.0, -0.8, 0.0]
-        return replace(seen, positions=positions)
-
-    fused = run(fusion(), changed(frames(3.0), "kinect2", elsewhere))
-    stamps = np.array([each.stamp for each in fused])
-    upward = np.sqrt([each.covariances[Joint.WRIST_RIGHT, 2, 2] for each in fused if each.covariances is not None])
-    apart = (stamps > 2.05) & (stamps < 2.2)
-    assert errors(fused)[apart, Joint.WRIST_RIGHT].max() < 0.05
-    assert (1.96 * upward[apart] > 0.8).all()
-    assert upward[(stamps > 2.3) | (stamps < 2.0)].max() < 0.1
-
-
 def test_a_wrist_beyond_an_inferred_elbow_counts_as_inferred() -> None:
     def raised(elbow: TrackingState) -> Callable[[Skeleton], Skeleton]:
         def change(seen: Skeleton) -> Skeleton:
