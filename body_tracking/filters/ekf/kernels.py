@@ -297,14 +297,13 @@ def crosses_updated(
     seen = np.dot(kalman, observation[rows]).astype(np.float32)
     result: SingleArray = crosses - np.dot(seen, crosses[:known])
     by_limbs = np.dot(kalman, limbs[rows])
-    for i in range(len(result)):
-        for k in range(len(rows)):
-            point, axis = rows[k] // 3, rows[k] % 3
-            for j in range(point + 1):
-                if own[point, j] != 0.0:
+    for k in range(len(rows)):
+        point, axis = rows[k] // 3, rows[k] % 3
+        for j in range(point + 1):
+            if own[point, j] != 0.0:
+                for i in range(len(result)):
                     result[i, place + 3 * j + axis] -= kalman[i, k] * own[point, j]
-        for k in range(limbs.shape[1]):
-            result[i, place + size + k] -= by_limbs[i, k]
+    result[:, place + size : place + size + limbs.shape[1]] -= by_limbs.astype(np.float32)
     return result
 
 

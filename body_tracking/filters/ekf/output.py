@@ -39,6 +39,7 @@ class Output:
         self._posture_variance = space.prior_table.stddev[self._postural] ** 2
         elevations = np.array([name.startswith("clavicle_elevation") for name in names] + [False] * 3)
         self._followed = elevations[self._postural]
+        self._without_lengths = np.delete(np.arange(space.size), space.lengths)
         self._last_handed_out: tuple[State, FloatArray, FloatArray] | None = None
 
     def forget(self) -> None:
@@ -62,10 +63,11 @@ class Output:
                 q = self._centred(q, state.covariance[space.tangent, space.tangent])
             if self._parameters.posture:
                 free, _ = self._priors.free(state, covariance, np.empty((space.size, 0), dtype=np.float32))
-                held = covariance - free
+                held = 0.0 if free is covariance else covariance - free
                 q = self._upright(q, state, free)
                 covariance = free + held
-            covariance[pose, pose] += np.outer(disputed, disputed) + np.outer(state.jump, state.jump)
+            changes = np.stack([disputed, state.jump])
+            covariance[pose, pose] += changes.T @ changes
             self._last_handed_out = state, q, covariance
         return self._last_handed_out[1:]
 
@@ -120,7 +122,7 @@ class Output:
             body,
             q,
             state.velocity,
-            np.delete(np.delete(known, space.lengths, 0), space.lengths, 1),
+            known.take(self._without_lengths, 0).take(self._without_lengths, 1),
             state.lengths,
             np.sqrt(known.diagonal()[space.lengths]),
         )

@@ -119,8 +119,8 @@ class Priors:
         if state.sources.names:
             turning = lines.rotation_jacobian[state.sources.segments].reshape(-1, space.nv)
             jacobian = np.concatenate([jacobian, turning])
-        _, singular, axes = np.linalg.svd(jacobian, full_matrices=False)
-        null = axes[singular < _NULL * singular[0]]
+        squared, axes = np.linalg.eigh(jacobian.T @ jacobian)
+        null = axes.T[squared < _NULL**2 * squared[-1]]
         state = state.but(null=null)
         if not len(null):
             return state

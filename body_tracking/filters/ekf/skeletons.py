@@ -51,6 +51,7 @@ class _Expected(NamedTuple):
         cross: (85, 57) covariance of the state with the innovation.
         own: (19, 3, 3) innovation covariance of each point, with the second-order terms.
         limbs: (57, 4) displacement by one standard deviation of each limb's length.
+        slow: (19, 19) the points' slow errors by independent ones of unit variance.
     """
 
     observation: FloatArray
@@ -59,6 +60,7 @@ class _Expected(NamedTuple):
     cross: FloatArray
     own: FloatArray
     limbs: FloatArray
+    slow: FloatArray
 
 
 class SkeletonUpdate:
@@ -190,7 +192,7 @@ class SkeletonUpdate:
             seen.observation,
             rows,
             place,
-            self._sensors.slow_errors(sensor, measurement, state.sources)[0],
+            seen.slow,
             seen.limbs,
         )
         for ball, turn in turns:
@@ -257,7 +259,7 @@ class SkeletonUpdate:
         turns = np.zeros((0, 3, 3))
         if correction is not None:  # derivatives by the tangent at the state
             turns = so3.right_jacobian(correction[self._model.ball_v])
-        own, along = self._sensors.slow_errors(sensor, measurement, state.sources)
+        slow, along = self._sensors.slow_errors(sensor, measurement, state.sources)
         found = _Expected(
             *expected(
                 q,
@@ -267,13 +269,14 @@ class SkeletonUpdate:
                 np.ascontiguousarray(spread[t, t]),
                 state.crosses,
                 self._sensors.place_of(state, measurement.sensor),
-                own,
+                slow,
                 along,
                 self._sensors.carried,
                 sensor.white,
                 turns,
                 self._model.tree,
-            )
+            ),
+            slow,
         )
         if correction is not None:
             known = space.nv if state.settled else space.observed
