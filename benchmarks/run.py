@@ -8,6 +8,7 @@ python benchmarks/run.py --all                all that can run here, one after t
 from __future__ import annotations
 
 import ast
+import importlib.util
 import os
 import shutil
 import subprocess
@@ -41,6 +42,7 @@ NOTHING = Need("", lambda: True)
 ROOT_RIGHTS = Need("root, or user namespaces", lambda: True)  # checked by the benchmark itself
 CHROMIUM = Need("chromium", lambda: any(map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))))
 MAKEHUMAN = Need(f"MakeHuman's data, `${WHEEL_VARIABLE}`", lambda: find_wheel() is not None)
+PEERS = Need("`pip install biorbd opensim`", lambda: all(map(importlib.util.find_spec, ("biorbd", "opensim"))))
 PAIRS, IMU = recordings("kinect_pairs"), recordings("imu")
 
 
@@ -83,6 +85,7 @@ BENCHMARKS = {
     "every_angle": Benchmark(5, options="--motions reaching,squat"),
     "ablation": Benchmark(40, options="--seeds 1 --layouts 2,4"),
     "honesty": Benchmark(3, options="--runs 40"),
+    "estimators": Benchmark(3, PEERS),
     "robustness": Benchmark(10, options="--runs 100"),
     "teleports": Benchmark(15, options="--runs 12"),
     "imu_and_camera": Benchmark(40, options="--seeds 1"),
