@@ -15,10 +15,10 @@ States and transitions (times from the mapping's ``SafetyLimits``)::
 
 Faults: no new angles for ``silence``, by the wall clock; no frame of any sensor for that long, although angles are
 still published (predicted ones); angles older than ``max_age`` or stamped in the future; angles of another convention
-or with other names than the mapping's; angles of two publishers; an angle that is not finite, anatomically impossible
-or less certain than allowed; no good calibration; a robot that is silent or off its command; a gap in the calls of
-:meth:`Follower.step`. Each is reported by name. Another publisher of the commands, a robot beyond its limits, and a gap
-of ``STANDSTILL`` stop at once, without holding.
+or with other names than the mapping's; angles of two publishers; an angle that is not finite, anatomically impossible,
+that jumps, or is less certain than allowed; no good calibration; a robot that is silent or off its command; a gap in
+the calls of :meth:`Follower.step`. Each is reported by name. Another publisher of the commands, a robot beyond its
+limits, and a gap of ``STANDSTILL`` stop at once, without holding.
 
 The caller passes two times: ``now_ns`` in ROS time, as stamps are (it may stand still or jump), and ``steady_ns``,
 which is monotonic. This is not a safety-rated function.
@@ -66,6 +66,10 @@ _MAX_ANGLE = 4.0 * math.pi
 
 _MAX_RATE = 50.0
 """rad/s: faster is an error. The elbow of a pitcher reaches 40 (Fleisig et al. 1995)."""
+
+_FRAME = 1.0 / 30.0
+"""Seconds in which a filter may correct an angle by as much as a person could turn it. Messages of two sensors' frames
+may be microseconds apart."""
 
 
 class FollowerError(BodyTrackingError):
@@ -176,6 +180,7 @@ class Follower:
         self._received_ns = 0
         self._angle_fault = "no angles yet"
         self._refusal = ""
+        self._jump: FloatArray = np.zeros(len(mapping.angles))
         self._columns: IntArray = np.array([mapping.names.index(name) for name in mapping.angles], dtype=np.intp)
         self._watched: tuple[str, ...] = ()
         self._sensors: dict[str, tuple[int, int]] = {}
@@ -215,8 +220,13 @@ class Follower:
             return jumped  # out of order or repeated
         self._angle_fault = ""
         columns = (angles.position, angles.velocity, angles.position_stddev, angles.velocity_stddev)
-        self._angles = JointAngles(angles.stamp_ns, self.mapping.angles, *(each[self._columns] for each in columns))
-        self._received_ns = steady_ns
+        used = JointAngles(angles.stamp_ns, self.mapping.angles, *(each[self._columns] for each in columns))
+        if self._angles is not None:
+            passed = (used.stamp_ns - self._angles.stamp_ns) / NANOSECONDS
+            with np.errstate(invalid="ignore"):  # unknown values are infinite or NaN
+                moved = np.abs(wrapped(used.position - self._angles.position))
+            self._jump = np.where(moved > _MAX_RATE * max(passed, _FRAME), moved, self._jump)
+        self._angles, self._received_ns = used, steady_ns
         return jumped
 
     def refuse_angles(self, reason: str) -> None:
@@ -322,6 +332,7 @@ class Follower:
         fatal = bool(fault)
         fault = fault or self._fault(steady_ns, elapsed, prediction)
         self._refusal = ""
+        self._jump[:] = 0.0
         if fault:
             self._good_since_ns, self._last_fault = None, fault
         elif self._good_since_ns is None:
@@ -360,6 +371,7 @@ class Follower:
         ahead = min(wait, self._limits.prediction)
         with np.errstate(invalid="ignore"):  # unknown values are infinite or NaN
             possible = (np.abs(angles.position) <= _MAX_ANGLE) & (np.abs(angles.velocity) <= _MAX_RATE)
+            possible &= self._jump == 0.0
             predicted = np.where(possible, angles.position + ahead * angles.velocity, np.nan)
             # An upper bound over all correlations of angle and velocity, which the message does not carry. Beyond the
             # horizon of the prediction the velocity itself is the error.
@@ -419,6 +431,8 @@ class Follower:
             angle, rate = angles.position[place], angles.velocity[place]
             if not np.isfinite([angle, rate]).all():
                 return f"{name} is not finite, or its velocity is not known"
+            if self._jump[place]:
+                return f"{name} jumped by {self._jump[place]:.2f} rad from one message to the next"
             if not np.isfinite(prediction.angle[place]):
                 return f"{name} is {angle:.3g} rad at {rate:.3g} rad/s; a person does not move so"
             if not prediction.stddev[place] <= most:

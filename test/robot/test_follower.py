@@ -266,6 +266,46 @@ def test_with_a_fault_nothing_begins(kind: str) -> None:
     assert reported in stopped.reason or (kind == "no angles" and stopped.reason == "no angles yet")
 
 
+def test_an_angle_that_jumps_farther_than_a_person_moves_is_not_followed_at_once() -> None:
+    bench = following()
+    before = place(bench.commands[-1])
+    bench.pose = [1.0 - math.pi, 0.0, 0.8]
+    held = bench.run(0.1)
+    assert held.state == State.HOLDING and "shoulder_elevation_left jumped by 3.14 rad" in held.reason
+    assert bench.run(0.35).state == State.HOLDING
+    np.testing.assert_allclose(place(bench.commands[-1]), before, atol=1e-9)
+    assert bench.run(0.2).state == State.APPROACHING  # the new pose lasts: it may be the right one
+    bench.pose = [1.0, 0.0, 0.8]
+    bench.run(0.04)
+    bench.pose = [1.0 + math.pi, 0.0, 0.8]  # two jumps, and one command after each
+    assert bench.run(0.04).state == State.HOLDING
+
+
+@pytest.mark.parametrize("messages", [1, 2, 3])
+def test_a_jump_counts_also_where_further_angles_come_before_the_next_command(messages: int) -> None:
+    bench = following()
+    for number in range(messages):
+        bench.elapsed_ns += PERIOD_NS // 4
+        bench.pose = [1.0 - math.pi * (number == 0), 0.0, 0.8]
+        bench.receive(CONVENTION)
+    bench.silent = True
+    assert "jumped by" in bench.run().reason
+
+
+def test_fast_angles_and_those_of_another_sensor_or_after_a_break_do_not_jump() -> None:
+    bench = following()
+    bench.pose, bench.velocity = [-0.2, 0.0, 1.9], [-40.0, 0.0, 33.0]  # in a thirtieth of a second
+    assert bench.run(0.05).state == State.FOLLOWING
+    bench.elapsed_ns += 10_000  # the frame of another sensor, which sees the arm a little elsewhere
+    bench.pose = [0.0, 0.0, 1.8]
+    bench.receive(CONVENTION)
+    assert bench.run().state == State.FOLLOWING
+    bench.every_ns = NANOSECONDS // 12
+    bench.run(0.2)
+    bench.pose, bench.velocity = [2.9, 0.0, 0.0], [0.0, 0.0, 0.0]
+    assert bench.run(0.2).state == State.FOLLOWING
+
+
 def test_unused_angles_may_be_unknown() -> None:
     bench = following()
     bench.pose[1] = math.nan
@@ -434,12 +474,14 @@ def test_while_the_robot_stands_still_its_command_stays_near_by_default() -> Non
     stands = np.array([1.0, 0.8])
     rng = np.random.default_rng(1)
     begun = 0
+    aim = np.array(bench.pose)
     for step in range(3600):
         bench.stands = list(stands)
         before = bench.follower.state
         command = bench.run()
         if step % 100 == 0:
-            bench.pose = [rng.uniform(-1.0, 2.5), 0.0, rng.uniform(0.0, 2.0)]
+            aim = np.array([rng.uniform(-1.0, 2.5), 0.0, rng.uniform(0.0, 2.0)])
+        bench.pose = list(bench.pose + np.clip(aim - bench.pose, -0.2, 0.2))  # quickly, but no jump
         if command.position is not None:
             lead = np.abs(command.position - stands)
             assert (lead <= allowed + rate * PERIOD).all()
