@@ -18,6 +18,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from body_tracking.core.arguments import SinglePath
 from body_tracking.core.parameters import (
     Parameter,
     ParameterError,
@@ -142,7 +143,10 @@ def add_options(parser: argparse.ArgumentParser, *names: str, **texts: str) -> N
             if choices and len(joined := ", ".join(choices)) > _WIDTH:
                 metavar, text = option.name.upper(), f"{text}; one of {joined}"
             default = option.default if isinstance(option.default, int | float) else None
-            group.add_argument(flag, type=kind, choices=choices, metavar=metavar, default=default, help=text)
+            action = SinglePath if option.path else "store"
+            group.add_argument(
+                flag, action=action, type=kind, choices=choices, metavar=metavar, default=default, help=text
+            )
 
 
 def options_from(args: argparse.Namespace) -> dict[str, Value]:

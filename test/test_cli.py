@@ -153,6 +153,7 @@ def test_missing_files_are_reported_in_one_line(
             "argument --around: expected one argument; write --around=-40,40",
             "body_tracking simulate",
         ),
+        ("up --bag bags/a --bag=bags/b", "argument --bag: given twice: bags/a and bags/b", "body_tracking up"),
         ("up --filter xyz", "argument --filter: invalid choice: 'xyz' (choose from ", "body_tracking up"),
     ],
 )

@@ -61,3 +61,15 @@ class Parser(argparse.ArgumentParser):
         if action.choices is not None and value not in action.choices and self.about_bag:
             raise argparse.ArgumentError(action, f"invalid choice: {value!r}; {self.about_bag}")
         super()._check_value(action, value)
+
+
+class SinglePath(argparse.Action):
+    """Stores a path; an error where the option is given twice with different ones, of which only one could be used."""
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option: str | None = None
+    ) -> None:
+        before = getattr(namespace, self.dest, None)
+        if before is not None and before not in (self.default, values):
+            raise argparse.ArgumentError(self, f"given twice: {before} and {values}")
+        setattr(namespace, self.dest, values)

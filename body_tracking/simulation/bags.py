@@ -245,6 +245,10 @@ def _imus(args: argparse.Namespace) -> Iterator[SimulatedImu]:
     twice = sorted({segment for segment in segments if segments.count(segment) > 1})
     if twice:
         raise SceneError(f"--imus {listed}: {', '.join(twice)} comes twice")
+    if not segments:
+        for option, given in (("--raw", args.raw), ("--no-magnetometer", args.no_magnetometer)):
+            if given:
+                raise SceneError(f"{option}: is about inertial sensors, which --imus names")
     for number, segment in enumerate(segments):
         yield SimulatedImu(
             f"imu_{segment}",

@@ -366,6 +366,8 @@ def test_the_shipped_parameters_file_holds_all_errors_at_their_defaults() -> Non
         (("--imus", "pelvis,pelvis"), "--imus pelvis,pelvis: pelvis comes twice"),
         (("--imus", "pelvis", "--imus", "pelvis"), "--imus pelvis,pelvis: pelvis comes twice"),
         (("--imus", "pelvis", "--imu-rate", "0"), "a rate of 0.0 Hz"),
+        (("--raw",), "--raw: is about inertial sensors, which --imus names"),
+        (("--no-magnetometer", "--imus="), "--no-magnetometer: is about inertial sensors"),
         (("--config", "nowhere.yaml"), "body_tracking: nowhere.yaml: cannot be read"),
     ],
 )
