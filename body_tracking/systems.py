@@ -153,7 +153,7 @@ def options_from(args: argparse.Namespace) -> dict[str, Value]:
     """The options that a command line sets; others are left out.
 
     Raises:
-        GraphError: a list of sensors without a name.
+        GraphError: a list of sensors without a name, or nobody to track.
     """
     found: dict[str, Value] = {}
     for name, option in OPTIONS.items():
@@ -164,6 +164,8 @@ def options_from(args: argparse.Namespace) -> dict[str, Value]:
             value = tuple(part for each in value for part in each.split(",") if part)
         if name == "sensors" and not value:
             raise graph.GraphError("sensors: no name")
+        if name == "people" and value == option.default:  # which stands for the largest number
+            raise graph.GraphError(f"people: {value}, expected 1 or more")
         if name == "sensors" and value == (graph.NO_SENSORS,):
             value = ()
         found[name] = tuple(value) if isinstance(option.default, tuple) else str(value) if option.path else value

@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 import pytest
 
 from body_tracking import cli
+from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.message_types import JOINT_STATE
 from body_tracking.recording.rosbag2 import BagWriter
 from body_tracking.ros import advice
@@ -210,6 +211,15 @@ def test_a_recording_to_play_is_the_first_option_of_up(capsys: pytest.CaptureFix
 )
 def test_sensors_may_be_a_list_or_repeated(words: list[str], sensors: tuple[str, ...] | None) -> None:
     assert options_from(cli.parser("up").parse_args(["up", *words])).get("sensors") == sensors
+
+
+@pytest.mark.parametrize("command", ["up", "replay"])
+def test_no_people_are_refused(command: str) -> None:
+    """They are the option's default, which stands for the largest number."""
+    words = [command, *(["bag", "-o", "out"] if command == "replay" else []), "--subject", "all", "--people"]
+    assert options_from(cli.parser(command).parse_args([*words, "2"]))["people"] == 2
+    with pytest.raises(BodyTrackingError, match="people: 0, expected 1 or more"):
+        options_from(cli.parser(command).parse_args([*words, "0"]))
 
 
 TAKEN = (
