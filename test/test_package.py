@@ -376,6 +376,21 @@ def test_picture_shows_every_node_and_topic() -> None:
     assert set(systems.EXECUTABLES) | topics <= texts
 
 
+def test_benchmarks_explain_themselves_without_what_they_need() -> None:
+    """``estimators`` without the peers, and a name that is none."""
+
+
+    def benchmark(*words: str) -> tuple[int, str, str]:
+        command = [sys.executable, str(ROOT / "benchmarks" / "run.py"), *words]
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=100)
+        return done.returncode, done.stdout, done.stderr
+
+    code, text, _ = benchmark("estimators", "--help")
+    assert code == 0 and "--search" in text
+    assert benchmark("mesh_fits") == (2, "", "no benchmark mesh_fits; did you mean 'mesh_fit'?\n")
+
+
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "benchmarks" / "README.md", *(ROOT / "docs").glob("*.md")]
 
 
