@@ -142,7 +142,8 @@ def add_options(parser: argparse.ArgumentParser, *names: str, **texts: str) -> N
             metavar = option.metavar or None
             if choices and len(joined := ", ".join(choices)) > _WIDTH:
                 metavar, text = option.name.upper(), f"{text}; one of {joined}"
-            default = option.default if isinstance(option.default, int | float) else None
+            number = isinstance(option.default, int | float) and option.name != "people"  # 0 is no number of people
+            default = option.default if number else None
             action = SinglePath if option.path else "store"
             group.add_argument(
                 flag, action=action, type=kind, choices=choices, metavar=metavar, default=default, help=text

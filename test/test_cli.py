@@ -216,7 +216,9 @@ def test_sensors_may_be_a_list_or_repeated(words: list[str], sensors: tuple[str,
 @pytest.mark.parametrize("command", ["up", "replay"])
 def test_no_people_are_refused(command: str) -> None:
     """They are the option's default, which stands for the largest number."""
-    words = [command, *(["bag", "-o", "out"] if command == "replay" else []), "--subject", "all", "--people"]
+    words = [command, *(["bag", "-o", "out"] if command == "replay" else []), "--subject", "all"]
+    assert "people" not in options_from(cli.parser(command).parse_args(words))
+    words.append("--people")
     assert options_from(cli.parser(command).parse_args([*words, "2"]))["people"] == 2
     with pytest.raises(BodyTrackingError, match="people: 0, expected 1 or more"):
         options_from(cli.parser(command).parse_args([*words, "0"]))

@@ -379,7 +379,6 @@ def test_picture_shows_every_node_and_topic() -> None:
 def test_benchmarks_explain_themselves_without_what_they_need() -> None:
     """``estimators`` without the peers, and a name that is none."""
 
-
     def benchmark(*words: str) -> tuple[int, str, str]:
         command = [sys.executable, str(ROOT / "benchmarks" / "run.py"), *words]
         environment = {**os.environ, "PYTHONPATH": str(ROOT)}
