@@ -106,6 +106,12 @@ def test_commands_of_the_documentation_work(page: Path, tmp_path: Path, t_pose: 
         assert code == 0, f"{page.name}: exit code {code} of\n{text}\n{output.read_text(errors='replace')}"
 
 
+def test_commands_are_listed_in_one_style() -> None:
+    text = (ROOT / "docs" / "reference.md").read_text()
+    said = re.findall(r"^\| `body_tracking [^`]+` \| (.*) \|$", text, re.MULTILINE)
+    assert len(said) > 20 and not [line for line in said if not line[0].islower() or line.endswith(".")]
+
+
 def test_skipped_commands_state_a_reason() -> None:
     """Otherwise a misspelt mark would skip a block."""
     for page in PAGES:

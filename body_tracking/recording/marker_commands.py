@@ -376,7 +376,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         parser.set_defaults(run=run)
         return parser
 
-    parser = command("calibrate", calibrate, "Calibrate the cameras from images of a chessboard; writes rig.yaml.")
+    parser = command("calibrate", calibrate, "calibrate the cameras from images of a chessboard; writes rig.yaml")
     parser.add_argument(
         "--camera",
         action="append",
@@ -391,7 +391,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
     marker_wand.add_parser(commands)
 
-    parser = command("target", target, "Measure a target that is turned before the cameras alone; into targets.yaml.")
+    parser = command("target", target, "measure a target that is turned before the cameras alone; into targets.yaml")
     parser.add_argument(
         "bag",
         type=Path,
@@ -409,7 +409,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("--overwrite", action="store_true", help="replace a target of this name")
 
-    parser = command("fit", fit, "Estimate the joints between targets from their motion; writes chain.yaml and a URDF.")
+    parser = command("fit", fit, "estimate the joints between targets from their motion; writes chain.yaml and a URDF")
     parser.add_argument("bag", type=Path, metavar="BAG", help="a recording in which every joint moves")
     parser.add_argument(
         "--joint",
@@ -420,12 +420,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an existing chain.yaml")
 
-    parser = command("angles", angles, "Compute the joint angles in a recording; writes them into a new one.")
+    parser = command("angles", angles, "compute the joint angles in a recording; writes them into a new one")
     parser.add_argument("bag", type=Path, metavar="BAG", help="a recording of images, balls or points")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="the bag to be written")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing OUT")
 
-    parser = command("check", check, "Read a setup, and check whether its targets can be distinguished.")
+    parser = command("check", check, "read a setup, and check whether its targets can be distinguished")
     parser.add_argument(
         "--noise",
         type=float,

@@ -203,7 +203,7 @@ def wand(args: argparse.Namespace) -> int:
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """``markers wand``."""
-    does = "Calibrate the poses of the cameras by a waved wand with three balls in a row; writes rig.yaml."
+    does = "calibrate the poses of the cameras by a waved wand with three balls in a row; writes rig.yaml"
     parser = commands.add_parser("wand", help=does, description=does)
     parser.add_argument("bag", type=Path, metavar="BAG", help="a recording of the cameras' images, or of the balls")
     parser.add_argument("--setup", type=Path, required=True, metavar="FOLDER", help="the folder of the setup")

@@ -257,7 +257,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     """``markers render``."""
     parser = commands.add_parser(
         "render",
-        help="Render a simulated arm with targets before two cameras.",
+        help="render a simulated arm with targets before two cameras",
         description="Renders images of a simulated person with targets on shoulder, upper arm and forearm before two "
         "infrared cameras, and writes them as a bag, with the true rig.yaml and targets.yaml.",
     )
