@@ -105,7 +105,7 @@ class _Plot:
             ),
             legend=uplot.Legend(show=False),
             height=HEIGHT,
-            padding=(4, 8, 0, 0),
+            padding=(7, 8, 0, 0),  # above: half a label, which was cut off where a tick is at the top
         )
         self._choice.visible = self._plot.visible = False  # until there is an angle
 

@@ -35,10 +35,12 @@ AXES = """() => Object.values(window.__viserTestpoints?.uplots ?? {}).map(({char
   context.font = font;
   return {
     labels: labels.filter(([at, text]) => text && at >= -0.5 && at <= box.height / ratio + 0.5),
+    top: box.top / ratio,
     room: axis._size - axis.gap - (axis.ticks.show ? axis.ticks.size : 0), widest: Math.max(...widths),
   };
 })"""
-"""Per plot: position in pixels and text of each label of the vertical axis, its widest label, and the room for it."""
+"""Per plot: position in pixels and text of each label of the vertical axis, the room above the uppermost place, the
+widest label, and the room for it."""
 
 
 @pytest.fixture
@@ -75,6 +77,7 @@ def test_vertical_axes_have_two_labels_that_do_not_overlap(plots: tuple[Plots, A
             for axis in page.evaluate(AXES):
                 places = sorted(at for at, _ in axis["labels"])
                 assert len(places) >= 2, (low, high, stddev, axis)
+                assert axis["top"] + places[0] >= 5.0, (low, high, stddev, axis)  # half a label's height
                 assert min(np.diff(places)) >= 10.0, (low, high, stddev, axis)
                 assert len({text for _, text in axis["labels"]}) == len(places), axis
                 assert axis["widest"] <= axis["room"], (low, high, stddev, axis)
