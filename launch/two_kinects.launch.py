@@ -56,7 +56,7 @@ def words(context: LaunchContext) -> list[str]:
             if value.lower() not in TRUTH:
                 raise UpError(f"{option.name}:={value}: expected true or false")
             found += [flag] * TRUTH[value.lower()]
-        elif value:
+        elif value != default_of(option):  # 0 people stand for the largest number, and up refuses them
             found.append(f"{flag}={value}")
     return found
 
