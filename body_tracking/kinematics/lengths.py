@@ -43,8 +43,8 @@ _PRIOR_BLOCKS = 3.0
 """Weight of the stated variance of slow errors against the observed spread, in blocks."""
 _MIN_STDDEV = 1e-5
 """Metres: least standard deviation of a length, so that covariances stay invertible."""
-_MIN_LENGTH = 0.005
-"""Metres."""
+MIN_LENGTH = 0.005
+"""Metres: no length is estimated shorter."""
 _STATURE_SHARE, _PROPORTION_SHARE, _SIDE_SHARE = 0.04, 0.08, 0.02
 """Relative standard deviations of lengths between people: common to all, per kind, per side."""
 _MIN_SCALE = 0.08
@@ -157,7 +157,7 @@ def _lengths_of(products: FloatArray) -> FloatArray:
     of = {name: products[..., column] for name, column in _COLUMN.items()}
 
     def root(square: FloatArray) -> FloatArray:
-        result: FloatArray = np.sqrt(np.maximum(square, _MIN_LENGTH**2))
+        result: FloatArray = np.sqrt(np.maximum(square, MIN_LENGTH**2))
         return result
 
     across = root(of["hips"])
@@ -166,10 +166,10 @@ def _lengths_of(products: FloatArray) -> FloatArray:
     for side in _SIDES:
         tip = root(of[f"hand_tip_{side}"])
         hand = root(of[f"hand_{side}"])
-        along = np.maximum(of[f"thumb_tip_{side}"] / tip, _MIN_LENGTH)
-        width = np.maximum(of[f"hip_across_{side}"] / across, _MIN_LENGTH)
+        along = np.maximum(of[f"thumb_tip_{side}"] / tip, MIN_LENGTH)
+        width = np.maximum(of[f"hip_across_{side}"] / across, MIN_LENGTH)
         found[f"hand_{side}"] = hand
-        found[f"hand_tip_{side}"] = np.maximum(tip - hand, _MIN_LENGTH)
+        found[f"hand_tip_{side}"] = np.maximum(tip - hand, MIN_LENGTH)
         found[f"thumb_along_{side}"] = along
         found[f"thumb_out_{side}"] = root(of[f"thumb_along_{side}"] - along**2)
         found[f"hip_width_{side}"] = width

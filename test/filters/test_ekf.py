@@ -46,6 +46,7 @@ from body_tracking.kinematics.upper_body import UNOBSERVED
 from body_tracking.simulation.people import MODEL
 from body_tracking.simulation.random_motion import RandomMotion
 from draws import draws, some
+from walkers import TRACKED
 
 POINTS = MODEL.joints
 OBSERVED = np.array([number for number, name in enumerate(MODEL.coordinate_names) if name not in UNOBSERVED])
@@ -257,6 +258,24 @@ def test_lengths_stay_once_they_are_known_and_the_output_has_them() -> None:
     assert np.abs(settled - settled[0]).max() < 1e-9
     assert np.abs(settled[0] - found[0][1]).max() > 1e-3  # they had been learnt before
     assert np.abs(settled[0] - truth.lengths).max() < 0.5 * np.abs(found[0][1] - truth.lengths).max()
+
+
+@pytest.mark.parametrize("seed", range(draws(3, 8)))
+def test_hips_level_with_the_spine_give_lengths_that_a_body_may_have(seed: int) -> None:
+    """Noise must not make the drop of the hips negative, which nothing that draws the body takes."""
+    lengths = MODEL.default_lengths()
+    lengths[MODEL.length_names.index("hip_drop")] = 0.0
+    positions = np.zeros((N_JOINTS, 3))
+    positions[POINTS] = MODEL.forward(MODEL.neutral(), lengths).positions + [2.5, 0.0, 1.0]
+    rng = np.random.default_rng(seed)
+    estimator = ExtendedKalmanFilter()
+    least = np.inf
+    for number in range(60):
+        noisy = positions + rng.normal(scale=0.004, size=positions.shape)
+        estimator.update(Skeleton(START_NS + number * NANOSECONDS // 30, "world", noisy, TRACKED))
+        if estimator.estimate is not None:
+            least = min(least, estimator.estimate.lengths.min())
+    assert 0.004 < least < np.inf
 
 
 def test_lengths_come_from_many_poses_once_there_are_some() -> None:

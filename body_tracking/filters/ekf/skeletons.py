@@ -17,6 +17,7 @@ from body_tracking.filters.ekf.poses import PoseSearch
 from body_tracking.filters.ekf.priors import Priors
 from body_tracking.filters.ekf.sensor_errors import STRETCH, SensorErrors
 from body_tracking.filters.ekf.state import Measurement, SensorState, State, StateSpace, single
+from body_tracking.kinematics.lengths import MIN_LENGTH
 
 _TRACKED = np.uint8(TrackingState.TRACKED)
 _EYE3 = np.eye(3)
@@ -213,7 +214,7 @@ class SkeletonUpdate:
             own_cross *= np.sqrt(ratio, dtype=np.float32)
         return state.but(
             q=self._model.integrate(state.q, correction[space.tangent]),
-            lengths=state.lengths + correction[space.lengths],
+            lengths=np.maximum(state.lengths + correction[space.lengths], MIN_LENGTH),
             velocity=state.velocity + correction[space.velocities],
             covariance=covariance,
             sensors={**state.sensors, measurement.sensor: learnt},
