@@ -59,6 +59,12 @@ GATE = 3.5
 REACQUIRE = 0.3
 """... unless a sensor has reported it there for this long, seconds."""
 
+_MISSED = 2.5
+"""Periods without a frame after which a slow sensor is silent: one frame may be lost."""
+
+_LONGEST_PERIOD = 1.0
+"""Longest time between two frames that is taken for a sensor's period, seconds; a longer one is an absence."""
+
 _DIAGONAL = np.arange(3)
 _FOREARMS = tuple((parent, child) for parent, child in BONES if parent.name.startswith(("ELBOW", "WRIST", "HAND")))
 
@@ -75,7 +81,9 @@ class FusionParameters:
             "choices": ("covariance", "thesis_text", "thesis_formula"),
         },
     )
-    silence: float = number_field(0.1, "drop a sensor whose newest frame is older than this", "s", 0.02, 5.0)
+    silence: float = number_field(
+        0.1, "drop a sensor whose newest frame is older than this and than 2.5 of its periods", "s", 0.02, 5.0
+    )
     max_wait: float = number_field(
         0.05, "wait at most this long for another sensor's frame that is due; 0 for the least delay", "s", 0.0, 1.0
     )
@@ -234,7 +242,9 @@ class Fusion(PlacedSensors[_Sensor]):
             states = np.where(known, states, 0)
         last = source.frames[-1] if source.frames else None
         step = math.inf if last is None else (skeleton.stamp_ns - last.stamp_ns) / NANOSECONDS
-        if last is not None and step < self.parameters.silence:
+        if step < _LONGEST_PERIOD:
+            source.rhythm.add(step)
+        if last is not None and step < self._silence_of(source):
             # Smoothed over about three frames: the difference of two is mostly noise.
             share = 1.0 - math.exp(-step / SMOOTHING)
             change = (positions - last.positions) / step
@@ -251,8 +261,10 @@ class Fusion(PlacedSensors[_Sensor]):
         source.frames.append(
             _Frame(skeleton.stamp_ns, positions, velocities, variance, states, float(angle), skeleton.body, since)
         )
-        if step < self.parameters.silence:
-            source.rhythm.add(step)
+
+    def _silence_of(self, source: _Sensor) -> float:
+        """Seconds without a frame after which a sensor is silent; more than ``silence`` for one that is slow."""
+        return max(self.parameters.silence, _MISSED * source.rhythm.period)
 
     def poll(self, now_ns: int) -> list[Skeleton]:
         """The fused skeletons whose wait is over."""
@@ -280,7 +292,7 @@ class Fusion(PlacedSensors[_Sensor]):
         if not reference.frames:
             return MAX_OUTPUT_GAP
         fastest = min(source.rhythm.period for source in self._sensors.values() if source.frames)
-        silent = stamp - reference.frames[-1].stamp_ns > self.parameters.silence * NANOSECONDS
+        silent = stamp - reference.frames[-1].stamp_ns > self._silence_of(reference) * NANOSECONDS
         if silent or reference.rhythm.period > _SLOWER * fastest:
             return round(SHARE_OF_PERIOD * fastest * NANOSECONDS)
         return MAX_OUTPUT_GAP
@@ -298,7 +310,7 @@ class Fusion(PlacedSensors[_Sensor]):
             if not source.frames or source.pose(stamp) is None:
                 continue
             age = (stamp - source.to_reference(source.frames[-1].stamp_ns)) / NANOSECONDS
-            if source.rhythm.due(age, self.parameters.silence):
+            if source.rhythm.due(age, self._silence_of(source)):
                 due.append(source.rhythm)
         return due
 
@@ -324,7 +336,7 @@ class Fusion(PlacedSensors[_Sensor]):
             if pose is None or frame is None:
                 continue
             age = (stamp - source.to_reference(frame.stamp_ns)) / NANOSECONDS
-            if age > self.parameters.silence:
+            if age > self._silence_of(source):
                 self.counters["silent"] += 1
                 continue
             names.append(name)

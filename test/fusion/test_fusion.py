@@ -224,6 +224,22 @@ def test_a_silent_sensor_is_dropped_within_a_tenth_of_a_second_and_faded_in_agai
     assert np.abs(np.diff(wrong[(stamps > 4.0) & (stamps < 4.6)])).max() < 0.012
 
 
+@pytest.mark.parametrize("every", [3, 4, 6])
+def test_a_slow_sensor_has_nearly_the_weight_of_a_fast_one_right_after_its_frames(every: int) -> None:
+    """At 10, 7.5 and 5 frames a second, longer apart than ``silence``; a little less, as it corrects the output."""
+    both = changed(frames(8.0), "kinect2", lowered(0.1))
+    number = {at: count for count, at in enumerate(at for name, _, at in both if name == "kinect2")}
+    fast = run(fusion(fade_in=0.5), both)
+    slow = run(fusion(fade_in=0.5), [each for each in both if each[0] == "kinect1" or number[each[2]] % every == 0])
+    due = [at for at, count in number.items() if count % every == 0]
+    after = [k for k, each in enumerate(slow) if any(0 <= each.stamp_ns - at < 0.03 * NANOSECONDS for at in due)]
+    assert [each.stamp_ns for each in slow] == [each.stamp_ns for each in fast] and len(after) > 30
+    trunk = [Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER]
+    shifts = [errors(fused)[after][:, trunk] for fused in (slow, fast)]
+    settled = [slow[k].stamp > 2.0 for k in after]
+    assert (shifts[0][settled] > 0.7 * shifts[1][settled]).mean() > 0.95
+
+
 @pytest.mark.parametrize(("late", "lag"), [("kinect1", 0.3), ("kinect2", 0.3), ("kinect1", 0.05)])
 def test_a_sensor_whose_frames_arrive_too_late_is_named(late: str, lag: float) -> None:
     stage = FusionStage(check_all(FusionStage.PARAMETERS, {"sensors": ("kinect1", "kinect2")}))
