@@ -358,7 +358,8 @@ class JointCentres:
     Only skeletons with covariances are used.
 
     Args:
-        counters: counts ``t_poses`` that were used, and ``t_poses_refused``, which failed the gate.
+        counters: counts ``t_poses`` that were used, ``t_poses_refused``, which failed the gate, and
+            ``t_poses_forgotten``, people with an estimate who were forgotten.
 
     Attributes:
         offsets: the estimate; None before the first T-pose.
@@ -366,14 +367,16 @@ class JointCentres:
 
     def __init__(self, counters: dict[str, int]) -> None:
         self._counters = counters
-        counters |= {"t_poses": 0, "t_poses_refused": 0}
+        counters |= {"t_poses": 0, "t_poses_refused": 0, "t_poses_forgotten": 0}
         self._gates: dict[int, float] = {}
+        self.offsets: Offsets | None = None
         self.reset()
 
     def reset(self) -> None:
         """Forget the person."""
+        self._counters["t_poses_forgotten"] += self.offsets is not None
         self._sensors: dict[str, _Evidence] = {}
-        self.offsets: Offsets | None = None
+        self.offsets = None
         self._before: FloatArray = np.zeros((len(LEARNT), 3))
         self._since_ns = self._first_ns = 0
         self._held_ns = self._refused_ns = _LONG_AGO_NS

@@ -10,7 +10,7 @@ from body_tracking.core.clocks import jumped_back
 from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.orientation import SegmentOrientation
 from body_tracking.core.qos import Qos
-from body_tracking.core.skeleton import Skeleton
+from body_tracking.core.skeleton import NANOSECONDS, Skeleton
 from body_tracking.filters import THESIS_FILTERS, ModelFilter, SkeletonFilter
 from body_tracking.filters.prediction import Prediction
 from body_tracking.filters.smoothing import FixedLag, SmoothableFilter
@@ -26,8 +26,12 @@ from body_tracking.messages.codecs import (
     Text,
 )
 from body_tracking.pipeline import graph
+from body_tracking.pipeline.people import HOLD
 from body_tracking.pipeline.shared import names_in, sensors_of
 from body_tracking.pipeline.stage import Port
+
+_AWAY_NS = round(HOLD * NANOSECONDS)
+"""Nanoseconds without a frame or an orientation after which the next ones may be of another person."""
 
 
 class PersonFilter:
@@ -63,7 +67,8 @@ class PersonFilter:
         several: bool,
     ) -> None:
         self._filter = estimator
-        name, sensors = values["filter"], sensors_of(values)
+        name, sensors = str(values["filter"]), sensors_of(values)
+        self._name = name
         self.alignment: SensorAlignment | None = None
         if by_sensor and sensors:
             self.alignment = SensorAlignment(sensors, values["reference"] or None, values["world_frame"])
@@ -72,11 +77,7 @@ class PersonFilter:
         self._corrects_fused = corrects and (bool(self._kinects) or not sensors)
         self._ordering = Ordering(sensors, values["order_wait"])
         self._model_filter = estimator if isinstance(estimator, ModelFilter) else None
-        self._lag: FixedLag | None = None
-        if values["lag"]:
-            if not isinstance(estimator, SmoothableFilter):
-                raise graph.GraphError(f"filter {name} cannot smooth (lag, --smooth)")
-            self._lag = FixedLag(estimator, values["lag"])
+        self._lag = self._lag_of(values["lag"])
         self._prediction = Prediction(values["predict_after"])
         self._lengths = LengthChanges()
         self._topics = graph.model_topics(body, several)
@@ -86,7 +87,27 @@ class PersonFilter:
         self._predicted = 0
         self._overtaken = 0
         self._published_ns: int | None = None
+        self._seen_ns: int | None = None
         self.tracked = False
+
+    def _lag_of(self, seconds: float) -> FixedLag | None:
+        if not seconds:
+            return None
+        if not isinstance(self._filter, SmoothableFilter):
+            raise graph.GraphError(f"filter {self._name} cannot smooth (lag, --smooth)")
+        return FixedLag(self._filter, seconds)
+
+    def change(self, values: Mapping[str, Any]) -> None:
+        """Use other values of ``order_wait``, ``predict_after`` and ``lag``; frames that are held back are published.
+
+        Raises:
+            GraphError: the filter cannot smooth; nothing is changed.
+        """
+        lag = self._lag_of(values["lag"])
+        self.flush()
+        self._lag = lag
+        self._ordering.set_wait(values["order_wait"])
+        self._prediction.set_after(values["predict_after"])
 
     @property
     def counters(self) -> dict[str, int]:
@@ -125,6 +146,8 @@ class PersonFilter:
         if self._corrects_fused:
             skeleton = corrected_kinect(skeleton)
         self.tracked = True
+        if self._model_filter is None:
+            self._see(skeleton.stamp_ns)
         if self._model_filter is not None:
             self._take([("", skeleton)], now_ns)
         elif (filtered := self._filter.update(skeleton)) is None:
@@ -155,6 +178,7 @@ class PersonFilter:
         if self._model_filter is None:
             return
         self.poll(now_ns)
+        self._see(measurement.stamp_ns)
         taken = self._model_filter.take_orientation(measurement)
         if taken and not self.newest_ns and self._prediction.due_ns is None:
             self._prediction.arrived(measurement.stamp_ns, now_ns)
@@ -227,14 +251,25 @@ class PersonFilter:
             else:
                 self._send(skeleton, estimate)
 
-    def reset(self) -> None:
-        """Publish the held frames, and forget the person, after a jump of time; poses and clocks stay."""
+    def _see(self, stamp_ns: int) -> None:
+        """Note that the person was seen, by a camera or a worn sensor; after a longer absence it may be another one."""
+        last_ns = self._seen_ns
+        if last_ns is not None and stamp_ns - last_ns > _AWAY_NS:
+            self._forget_person()
+        if last_ns is None or stamp_ns > last_ns or jumped_back(stamp_ns, last_ns):
+            self._seen_ns = stamp_ns
+
+    def _forget_person(self) -> None:
         self.flush()
         self._filter.reset()
+        self._lengths.reset()
+
+    def reset(self) -> None:
+        """Publish the held frames, and forget the person, after a jump of time; poses and clocks stay."""
+        self._forget_person()
         self._ordering.flush()
         self._prediction.stop()
-        self._lengths.reset()
-        self._published_ns = None
+        self._published_ns = self._seen_ns = None
         self.tracked = False
 
     def forget(self) -> None:
@@ -247,6 +282,7 @@ class PersonFilter:
         """Filter frames, and publish the estimate after each one that is the newest."""
         assert self._model_filter is not None
         for sensor, skeleton in frames:
+            self._see(skeleton.stamp_ns)
             if not self._model_filter.take(skeleton, sensor):
                 continue
             estimate = self._model_filter.estimate

@@ -21,9 +21,13 @@ class Prediction:
     """
 
     def __init__(self, after: float) -> None:
-        self._after_ns = round(after * NANOSECONDS)
+        self.set_after(after)
         self._delay_ns = 0
         self.due_ns: int | None = None
+
+    def set_after(self, after: float) -> None:
+        """Change the time without a frame, seconds; counts from the next frame."""
+        self._after_ns = round(after * NANOSECONDS)
 
     def arrived(self, stamp_ns: int, now_ns: int) -> None:
         """A frame with this capture time has just been filtered."""

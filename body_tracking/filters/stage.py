@@ -31,7 +31,7 @@ from body_tracking.messages.codecs import (
     Orientation,
 )
 from body_tracking.pipeline import graph
-from body_tracking.pipeline.people import ALL, PEOPLE, people_from
+from body_tracking.pipeline.people import ALL, HOLD, PEOPLE, people_from
 from body_tracking.pipeline.roles import role_of
 from body_tracking.pipeline.shared import (
     BODY,
@@ -140,11 +140,17 @@ def filter_parameters(name: str, values: Mapping[str, Value]) -> dict[str, Any]:
     return fields_of(parameter_classes()[prefix], values, prefix=prefix)
 
 
+def _determines_results(values: Mapping[str, Value]) -> tuple[object, ...]:
+    """The settable values on which a filter's estimates depend; without those of other filters."""
+    name = str(values["filter"])
+    return name, filter_parameters(name, values), values["kinect_v2"], values["not_kinects"]
+
+
 _CALIBRATIONS = 1000
 """Queue of poses and clocks, long enough that none is lost while the filter is busy."""
 _ORIENTATIONS = 32
 """Queue of orientations per segment: half a second."""
-_AWAY = NANOSECONDS
+_AWAY = round(HOLD * NANOSECONDS)
 """Nanoseconds without a fused frame of one of several people after which that person is forgotten."""
 
 
@@ -177,7 +183,7 @@ class FilterStage(Stage):
         super().__init__(values, wanted)
         self._published: list[Output] = []
         self._tracked: tuple[str, ...] = ()
-        self._t_poses = 0
+        self._t_poses: Counter[str] = Counter()
         self._stamp_ns = 0
         self._people: People | None = None
         self._received = dict.fromkeys(sensors_of(values), 0)
@@ -243,13 +249,21 @@ class FilterStage(Stage):
         return ()
 
     def change(self, values: Mapping[str, Value]) -> None:
-        """Start a new filter at the next frame; frames that the present one holds back are published.
+        """Publish the frames that are held back; start a new filter at the next frame where its results would differ.
 
-        It takes over the sensors' poses and clocks, since latched messages come once.
+        It takes over the sensors' poses and clocks, since latched messages come once, but knows nobody.
         """
+        if _determines_results(values) == _determines_results(self.values):
+            for person in self._persons:
+                person.change(values)
+            self.values = values
+            return
         made = self._persons_of(values)
+        for former in self._persons:
+            former.reset()
+        self._report_t_poses(self.counters)
+        self._t_poses.clear()
         for person, former in zip(made.values(), self._persons, strict=True):
-            former.flush()
             if person.alignment is not None and former.alignment is not None:
                 person.alignment = former.alignment
         self._use(values, made)
@@ -363,15 +377,24 @@ class FilterStage(Stage):
 
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
         counters = self.counters
-        before, self._t_poses = self._t_poses, counters.get("t_poses", 0)
-        if self._t_poses > before:
-            self.events.append("joint centres of this person estimated from a T-pose: angles are more accurate now")
+        self._report_t_poses(counters)
         name, frozen = str(self.values["filter"]), "" if self._people is None else self._people.frozen
         absent = [each for each in dict.fromkeys(names_in(self.values["not_kinects"])) if each not in self._received]
         strange = f"not_kinects: no sensor {', '.join(absent)} here" if absent and self._received else ""
         notes = [note for note in (frozen, strange) if note]
         text = f"{name} ({'; '.join(notes)})" if notes else name
         return int(bool(notes)), text, {"tracked": ", ".join(self._tracked_ids()), **counters}
+
+    def _report_t_poses(self, counters: Mapping[str, int]) -> None:
+        """Tell of T-poses that were used or forgotten since the last call."""
+        before, self._t_poses = self._t_poses, Counter(counters)
+        if self._t_poses["t_poses"] > before["t_poses"]:
+            self.events.append("joint centres of this person estimated from a T-pose: angles are more accurate now")
+        if self._t_poses["t_poses_forgotten"] > before["t_poses_forgotten"]:
+            self.events.append(
+                "the T-pose no longer counts: its person was away, time jumped back, or the filter was changed; hold "
+                "another one"
+            )
 
     @property
     def counters(self) -> Mapping[str, int]:

@@ -50,12 +50,16 @@ class Ordering:
 
     def __init__(self, sensors: Sequence[str], wait: float) -> None:
         self.counters: Counter[str] = Counter()
-        self._wait_ns = round(wait * NANOSECONDS)
+        self.set_wait(wait)
         self._sources = {sensor: _Source() for sensor in sensors}
         self._waiting: list[_Waiting] = []
         self._flushed: list[tuple[str, Skeleton]] = []  # before a jump of time
         self._arrived = 0
         self._left_ns: int | None = None
+
+    def set_wait(self, wait: float) -> None:
+        """Change the longest waiting time of the frames to come, seconds."""
+        self._wait_ns = round(wait * NANOSECONDS)
 
     def push(self, sensor: str, skeleton: Skeleton, now_ns: int) -> list[tuple[str, Skeleton]]:
         """Take one frame.

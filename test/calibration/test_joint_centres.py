@@ -197,7 +197,7 @@ def test_angles_are_better_in_all_poses_after_a_t_pose() -> None:
         counters: dict[str, int] = {}
         centres = JointCentres(counters)
         stamp_ns = held(centres, seen(T_POSE, local)) + 5 * NANOSECONDS
-        assert counters == {"t_poses": 1, "t_poses_refused": 0}
+        assert counters == {"t_poses": 1, "t_poses_refused": 0, "t_poses_forgotten": 0}
         for pose in POSES[::3]:
             frame = skeleton(seen(pose, local), stamp_ns)
             before.append(angles(frame.positions) - angles(pose))
@@ -271,7 +271,7 @@ def test_other_poses_give_no_offsets(pose: FloatArray, refused: int) -> None:
     counters: dict[str, int] = {}
     centres = JointCentres(counters)
     stamp_ns = held(centres, pose)
-    assert counters == {"t_poses": 0, "t_poses_refused": refused}
+    assert counters == {"t_poses": 0, "t_poses_refused": refused, "t_poses_forgotten": 0}
     assert centres.offsets is None
     assert_allclose(corrected(centres, skeleton(pose, stamp_ns)), pose)
 
@@ -355,7 +355,7 @@ def test_a_pose_is_counted_once_for_all_sensors() -> None:
             stamp_ns = start * NANOSECONDS + number * FRAME_NS
             for sensor, positions in (("kinect1", T_POSE), ("kinect2", T_POSE), ("kinect3", aside)):
                 centres.update(skeleton(positions, stamp_ns), sensor)
-        assert counters == {"t_poses": 1 + (start > 0), "t_poses_refused": 0}
+        assert counters == {"t_poses": 1 + (start > 0), "t_poses_refused": 0, "t_poses_forgotten": 0}
 
 
 def test_a_lost_frame_hardly_changes_when_a_pose_is_learnt_from() -> None:
@@ -440,5 +440,5 @@ def test_real_movements_without_a_t_pose_are_not_taken_for_one(shared_data: Path
                 stated = BASE_STDDEV[:, None, None] ** 2 * np.eye(3)
                 centres.update(replace(each, covariances=stated), frame.sensor)
                 frames += 1
-        assert counters == {"t_poses": 0, "t_poses_refused": 0}, path.name
+        assert counters == {"t_poses": 0, "t_poses_refused": 0, "t_poses_forgotten": 0}, path.name
     assert frames > 3000

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from body_tracking.calibration.joint_centres import LEARNT, posed
 from body_tracking.core.measurement import BASE_STDDEV
-from body_tracking.core.skeleton import FloatArray, Joint, Skeleton
+from body_tracking.core.orientation import SegmentOrientation
+from body_tracking.core.parameters import check_all
+from body_tracking.core.sensor_poses import SensorPose
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton
 from body_tracking.filters import SkeletonFilter, make_filter
+from body_tracking.filters.stage import FilterStage
 from body_tracking.kinematics import positional
 from body_tracking.kinematics.positional import ANGLE_NAMES, angles_over_time
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.people import HOLD
+from body_tracking.pipeline.stage import Now
 from draws import draws, some
 from walkers import TRACKED, frame, performed
 
@@ -125,6 +135,94 @@ def test_they_are_not_too_sure_of_where_arms_point(name: str, monkeypatch: pytes
 def test_who_is_not_seen_for_a_moment_need_not_hold_the_pose_again(name: str) -> None:
     errors, _ = run(make_filter(name), left_out=range(100, 100 + round(GAP * RATE)))
     assert rms(errors) < 0.4 * rms(untaught(name))
+
+
+INPUTS = [("lkf_constant_velocity", graph.FUSED_INPUT), ("ekf", graph.FUSED_INPUT), ("ekf", graph.SENSORS_INPUT)]
+
+
+def hosted(name: str, source: str, **values: Any) -> FilterStage:
+    given = {"filter": name, "input": source, "sensors": ("kinect1",), "kinect_v2": False, **values}
+    stage = FilterStage(check_all(FilterStage.PARAMETERS, given))
+    stage.take(graph.CALIBRATION, SensorPose("kinect1", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])), Now(0, 0))
+    return stage
+
+
+def fed(stage: FilterStage, frames: Iterable[Skeleton]) -> list[Skeleton]:
+    """The filtered skeletons."""
+    topic = graph.FUSED if graph.FUSED in {port.topic for port in stage.inputs} else graph.skeleton_topic("kinect1")
+    found = []
+    for each in frames:
+        now = Now(each.stamp_ns, each.stamp_ns)
+        outputs = [*stage.take(topic, (each,), now), *stage.poll(now.steady_ns)]
+        found += [body for output in outputs if output.topic == graph.FILTERED for body in output.payload]
+    return found
+
+
+def others(away: float) -> list[Skeleton]:
+    """Another person, whose joints are seen where they are, this many seconds after the end of the first one's pose."""
+    first = skeletons()[MOVING.start].stamp_ns
+    later_ns = skeletons()[HOLDING.stop - 1].stamp_ns + round(away * NANOSECONDS) - first
+    covariances = BASE_STDDEV[:, None, None] ** 2 * np.eye(3)
+    return [
+        Skeleton(each.stamp_ns + later_ns, each.frame_id, true, TRACKED, body=2, covariances=covariances)
+        for each, true in zip(skeletons()[MOVING.start : MOVING.start + 15], reaching()[MOVING.start :], strict=False)
+    ]
+
+
+@pytest.mark.parametrize(("name", "source"), INPUTS)
+def test_another_person_is_filtered_as_if_nobody_had_been_there(name: str, source: str) -> None:
+    stage, alone = hosted(name, source), hosted(name, source)
+    fed(stage, skeletons()[: HOLDING.stop])
+    stage.state(0)
+    assert stage.counters["t_poses"] == 1 and "T-pose" in stage.events.pop()
+    start_ns = others(HOLD + 0.1)[0].stamp_ns  # the frames before are predicted
+    found, expected = (
+        [seen for seen in fed(each, others(HOLD + 0.1)) if seen.stamp_ns >= start_ns] for each in (stage, alone)
+    )
+    assert len(found) == len(expected) > 10
+    for one, other in zip(found, expected, strict=True):
+        assert_array_equal(one.positions, other.positions)
+        assert_array_equal(one.covariances, other.covariances)
+    stage.state(0)
+    assert "the T-pose no longer counts" in stage.events.pop()
+
+
+@pytest.mark.parametrize(("name", "source"), INPUTS)
+def test_who_is_away_for_less_keeps_the_pose(name: str, source: str) -> None:
+    stage = hosted(name, source)
+    fed(stage, skeletons()[: HOLDING.stop])
+    fed(stage, others(HOLD - 0.1))
+    assert stage.counters["t_poses_forgotten"] == 0
+
+
+def test_who_wears_a_sensor_is_never_another_person() -> None:
+    stage = hosted("ekf", graph.SENSORS_INPUT, orientations=("forearm_left",))
+    fed(stage, skeletons()[: HOLDING.stop])
+    start_ns = skeletons()[HOLDING.stop - 1].stamp_ns
+    for number in range(1, round(HOLD + 1.0) * 10):
+        stamp_ns = start_ns + number * NANOSECONDS // 10
+        worn = SegmentOrientation(stamp_ns, "left", "forearm_left", np.eye(3), np.eye(3))
+        stage.take(graph.orientation_topic("forearm_left"), worn, Now(stamp_ns, stamp_ns))
+    fed(stage, others(HOLD + 1.1))
+    assert stage.counters["t_poses_forgotten"] == 0
+
+
+@pytest.mark.parametrize(("name", "source"), INPUTS)
+def test_only_a_change_that_concerns_the_estimate_forgets_the_pose(name: str, source: str) -> None:
+    stage, same = hosted(name, source), hosted(name, source)
+    prefix = "ekf." if name == "ekf" else ""
+    foreign = "measurement_noise_scale" if name == "ekf" else "ekf.predict_for"
+    for each in (stage, same):
+        fed(each, skeletons()[: HOLDING.stop])
+        each.state(0)
+        each.events.clear()
+    stage.change({**stage.values, "predict_after": 0.5, "order_wait": 0.01, foreign: 0.7})
+    following = skeletons()[HOLDING.stop : HOLDING.stop + 15]
+    for one, other in zip(fed(stage, following), fed(same, following), strict=True):
+        assert_array_equal(one.positions, other.positions)
+    assert not stage.events
+    stage.change({**stage.values, f"{prefix}predict_for": 0.7})
+    assert "the T-pose no longer counts" in stage.events.pop()
 
 
 def test_lengths_are_those_between_the_joints_as_they_are_known_then() -> None:
