@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -21,6 +21,7 @@ from body_tracking.kinematics.positional import positional_angles
 from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.codecs import Angles, ModelCovariance, ModelState
 from body_tracking.pipeline import graph
+from body_tracking.pipeline.pairs import Pairs
 from body_tracking.pipeline.people import ALL, PEOPLE, people_from
 from body_tracking.pipeline.shared import BODY, RELIABLE, result_qos, skeleton_input, skeleton_qos
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
@@ -210,10 +211,8 @@ class AnglesStage(Stage):
         super().__init__(values, wanted)
         # which input the filter publishes: confirmed, and at the last check
         self._published = self._seen = ""
-        self._unpaired = 0
-        # of each person, state and covariance by stamp, in the order of arrival
-        self._waiting: dict[str, OrderedDict[int, dict[str, Any]]] = {}
         self._configure(values)
+        self._pairs = {body: Pairs(_UNPAIRED) for body in self.streams}
         qos = result_qos(values)
         self.outputs = tuple(
             Port(topic, Angles(body, part, lambda: self.convention), qos, measured=part == 0)
@@ -245,7 +244,6 @@ class AnglesStage(Stage):
             self.streams = {each: AngleStream(convention, _AWAY_S, of_bones) for each in graph.bodies(people.people)}
         else:
             self.streams = {body: AngleStream(convention, of_bones=of_bones)}
-        self._waiting = {body: OrderedDict() for body in self.streams}
         self._states: dict[str, str] = {}
         self._covariances: dict[str, str] = {}
         if self.source == graph.SKELETON_INPUT:
@@ -296,26 +294,19 @@ class AnglesStage(Stage):
         return [output for body, each in angles if each is not None for output in _published(body, each)]
 
     def _pair(self, body: str, stamp_ns: int, part: str, value: Any) -> Iterable[Output]:
-        """Compute once state and covariance are there; older unpaired ones are dropped."""
-        waiting, stream = self._waiting[body], self.streams[body]
-        found = waiting.setdefault(stamp_ns, {})
-        found[part] = value
-        if len(found) == 2:
-            while waiting.popitem(last=False)[0] != stamp_ns:
-                self._unpaired += 1
-            _, frame_id, q, velocity = found["state"]
-            estimate = state_estimate(stream.model, stamp_ns, frame_id, q, velocity, found["covariance"])
-            return _published(body, stream.of_estimate(estimate))
-        if len(waiting) > _UNPAIRED:
-            waiting.popitem(last=False)
-            self._unpaired += 1
-        return ()
+        """Compute once state and covariance are there."""
+        found = self._pairs[body].add(stamp_ns, part, value)
+        if found is None:
+            return ()
+        stream, (_, frame_id, q, velocity) = self.streams[body], found["state"]
+        estimate = state_estimate(stream.model, stamp_ns, frame_id, q, velocity, found["covariance"])
+        return _published(body, stream.of_estimate(estimate))
 
     def reset(self, topic: str) -> None:
         for stream in self.streams.values():
             stream.reset()
-        for waiting in self._waiting.values():
-            waiting.clear()
+        for pairs in self._pairs.values():
+            pairs.clear()
 
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
         """The convention, and the counters of the fits."""
@@ -323,8 +314,8 @@ class AnglesStage(Stage):
         for stream in self.streams.values():
             fits.update(stream.counters)
         values: dict[str, object] = {f"fit {name}": count for name, count in fits.items()}
-        if self._unpaired:
-            values["unpaired"] = self._unpaired
+        if unpaired := sum(pairs.unpaired for pairs in self._pairs.values()):
+            values["unpaired"] = unpaired
         if not self.source:
             return 1, "no filter publishes anything", values
         text = f"{self.convention} angles of {self.source}"

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -36,6 +36,7 @@ from body_tracking.messages.calibration import transform_to_pose
 from body_tracking.messages.diagnostics import statuses
 from body_tracking.messages.robots import command_to_array, command_to_trajectory
 from body_tracking.pipeline import graph
+from body_tracking.pipeline.pairs import Pairs
 from body_tracking.pipeline.shared import BODY, RELIABLE, SENSORS, result_qos
 from body_tracking.robot.calibration import CalibrationQuality
 from body_tracking.robot.follower import Command, Follower, FollowerError, State
@@ -78,7 +79,7 @@ class RobotCommands(GraphNode):
         self.follower.watch_sensors(self.sensors)
 
     def start(self) -> None:
-        self.waiting: OrderedDict[int, dict[str, JointState]] = OrderedDict()
+        self.pairs = Pairs(_UNPAIRED)
         self.command: Command | None = None
         self.switched: Counter[str] = Counter()
         self.started_ns = time.monotonic_ns()
@@ -86,9 +87,9 @@ class RobotCommands(GraphNode):
         kind = JointTrajectory if output.kind == TRAJECTORY else Float64MultiArray
         self.output = self.create_publisher(kind, output.topic, to_profile(RELIABLE_QOS))
         qos = to_profile(result_qos(self.values))
-        angles = (graph.joint_states_topic(self.body), graph.joint_states_stddev_topic(self.body))
-        for topic in angles:
-            self.subscribe(topic, JointState, qos, partial(self.on_angles, self.full_name(topic)))
+        values, deviations = graph.joint_states_topic(self.body), graph.joint_states_stddev_topic(self.body)
+        for topic, part in ((values, "values"), (deviations, "deviations")):
+            self.subscribe(topic, JointState, qos, partial(self.on_angles, self.full_name(topic), part))
         for sensor in self.sensors:
             self.subscribe_to_skeletons(graph.skeleton_topic(sensor), partial(self.on_skeletons, sensor))
         self.subscribe(graph.CALIBRATION, TransformStamped, to_profile(LATCHED), self.on_calibration)
@@ -103,29 +104,24 @@ class RobotCommands(GraphNode):
             )
         self.create_timer(1.0 / float(str(self.values["rate"])), self.publish_command, clock=STEADY)
 
-    def on_angles(self, topic: str, message: JointState, sent_ns: int) -> None:
+    def on_angles(self, topic: str, part: str, message: JointState, sent_ns: int) -> None:
         """Pair angles and their standard deviations by stamp, and pass pairs to the follower."""
         if self.has_switched(topic):
             self.follower.refuse_angles(f"{topic}: angles {_SWITCHED}")
         stamp_ns = to_nanoseconds(message.header.stamp)
         self.monitor.message_in(topic, stamp_ns)
-        pair = self.waiting.setdefault(stamp_ns, {})
-        pair[topic] = message
-        if len(pair) == 2:
-            while self.waiting.popitem(last=False)[0] != stamp_ns:
-                self.monitor.totals["unpaired"] += 1
-            values, deviations = (pair[name] for name in sorted(pair))
-            try:
-                angles = joint_states_to_angles(values, deviations, self.body)
-            except MessageError as error:
-                self.follower.refuse_angles(str(error))
-                raise
-            convention = str(values.header.frame_id)
-            if self.follower.receive_angles(angles, convention, self.now_ns(), time.monotonic_ns()):
-                self.log_jump(topic)
-        elif len(self.waiting) > _UNPAIRED:
-            self.waiting.popitem(last=False)
-            self.monitor.totals["unpaired"] += 1
+        pair = self.pairs.add(stamp_ns, part, message)
+        if pair is None:
+            return
+        values = pair["values"]
+        try:
+            angles = joint_states_to_angles(values, pair["deviations"], self.body)
+        except MessageError as error:
+            self.follower.refuse_angles(str(error))
+            raise
+        convention = str(values.header.frame_id)
+        if self.follower.receive_angles(angles, convention, self.now_ns(), time.monotonic_ns()):
+            self.log_jump(topic)
 
     def on_skeletons(self, sensor: str, skeletons: tuple[Skeleton, ...], sent_ns: int) -> None:
         topic = self.full_name(graph.skeleton_topic(sensor))
@@ -177,7 +173,7 @@ class RobotCommands(GraphNode):
         return f"another publisher of {topic}: {', '.join(found)}"
 
     def time_jumped_back(self, topic: str) -> None:
-        self.waiting.clear()
+        self.pairs.clear()
         self.follower.time_jumped_back()
 
     def publish_command(self) -> None:
@@ -214,6 +210,8 @@ class RobotCommands(GraphNode):
             "nearest to a limit": command.nearest,
             "joints that keep their place": ", ".join(command.kept),
         }
+        if self.pairs.unpaired:
+            values["unpaired"] = self.pairs.unpaired
         return _LEVELS[command.state], f"{command.state}: {command.reason}", values
 
 

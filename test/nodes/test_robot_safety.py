@@ -48,7 +48,10 @@ ROBOTS = {
     "angles": True,
     "twin": True,
     "frames": True,
+    "remapped": True,
 }
+REMAPPED = ("/remapped/values", "/remapped/deviations")
+"""Topics of the angles of the robot "remapped"; by name the deviations come first."""
 
 
 def mapping(name: str, folder: Path, *, state: bool) -> Path:
@@ -72,6 +75,11 @@ def mapping(name: str, folder: Path, *, state: bool) -> Path:
     return file
 
 
+def topics_of(body: str) -> tuple[str, str]:
+    """The topics of a person's angles and of their standard deviations."""
+    return graph.joint_states_topic(body), graph.joint_states_stddev_topic(body)
+
+
 class Robot:
     """One arm with its node, and the angles of the person that it follows.
 
@@ -93,7 +101,7 @@ class Robot:
         self.doubled, self.released = False, True
         self.position = 0.0
         self.commands: list[float] = []
-        kinds = (graph.joint_states_topic(name), graph.joint_states_stddev_topic(name))
+        kinds = REMAPPED if name == "remapped" else topics_of(name)
         self.publishers = [[bench.node.create_publisher(JointState, topic, 10) for topic in kinds] for _ in range(2)]
         self.second_states: Any = None
         self.states = bench.node.create_publisher(JointState, f"/{name}/joint_states", 10)
@@ -168,6 +176,8 @@ class Bench:
             of = "doubled" if name == "second" else name
             arguments += ["-p", f"{name}:mapping:={files[of]}", "-p", f"{name}:body:={of}"]
             arguments += ["-p", f"{name}:sensors:=[kinect1]"]
+        for topic, other in zip(topics_of("remapped"), REMAPPED, strict=True):
+            arguments += ["-r", f"remapped:{topic.removeprefix('/')}:={other}"]
         rclpy.init(args=arguments, domain_id=domain())
         self.node = BenchNode("bench")
         self.executor = SingleThreadedExecutor()
@@ -294,6 +304,11 @@ def test_angles_with_other_names_are_refused(bench: Bench) -> None:
     robot.names = angle_names("isb")[::-1]
     robot.until_it_says("stopped", "order")
     assert min(robot.commands) > -0.02
+
+
+def test_angles_of_remapped_topics_are_not_their_deviations(bench: Bench) -> None:
+    robot = bench.robot("remapped")
+    robot.until_it_follows()
 
 
 # --- H3: doubled commands and doubled angles
