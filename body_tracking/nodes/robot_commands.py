@@ -148,6 +148,7 @@ class RobotCommands(GraphNode):
         self.follower.receive_robot_state(tuple(message.name), position, time.monotonic_ns())
 
     def on_enable(self, _: Any, response: Any) -> Any:
+        self.follower.report_publishers(self.others())
         try:
             self.follower.enable()
             response.success, response.message = True, "enabled"

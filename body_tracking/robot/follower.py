@@ -7,7 +7,8 @@ States and transitions (times from the mapping's ``SafetyLimits``)::
        │                 good for recover_after                      v     v
        └───────────a fault after stop_after of holding───────────── holding
 
-- *stopped*: no commands. The initial state; without a ``state_topic`` an operator has to enable the robot.
+- *stopped*: no commands. The initial state; without a ``state_topic`` an operator has to enable the robot, which then
+  begins at ``home``.
 - *approaching*: follows, starting at the robot's position; the rates grow from 0 to their limits: no jump.
 - *following*: each command is the person's posture, predicted to now, within the limits.
 - *holding*: repeats the last command, after joints with a limit of acceleration have braked. Where the robot did not
@@ -18,7 +19,8 @@ still published (predicted ones); angles older than ``max_age`` or stamped in th
 or with other names than the mapping's; angles of two publishers; an angle that is not finite, anatomically impossible,
 that jumps, or is less certain than allowed; no good calibration; a robot that is silent or off its command; a gap in
 the calls of :meth:`Follower.step`. Each is reported by name. Another publisher of the commands, a robot beyond its
-limits, and a gap of ``STANDSTILL`` stop at once, without holding.
+limits, and a gap of ``STANDSTILL`` stop at once, without holding. After them nobody knows where a robot without a
+``state_topic`` is: an operator has to enable it anew.
 
 The caller passes two times: ``now_ns`` in ROS time, as stamps are (it may stand still or jump), and ``steady_ns``,
 which is monotonic. This is not a safety-rated function.
@@ -152,7 +154,8 @@ class Follower:
 
     Attributes:
         state: the present state.
-        enabled: whether an operator has confirmed where the robot stands; always true with a ``state_topic``.
+        enabled: whether an operator has confirmed that the robot stood at ``home``, and nothing but this follower can
+            have moved it since; always true with a ``state_topic``.
         transitions: since the caller last cleared the list, the oldest first.
 
     Raises:
@@ -266,13 +269,15 @@ class Follower:
         self._other_publishers = problem
 
     def enable(self) -> None:
-        """Allow the robot to move: an operator confirms that it stands at ``home`` or where it was left.
+        """Allow the robot to move: an operator confirms that it stands at ``home``.
 
         Raises:
-            FollowerError: the robot is not stopped.
+            FollowerError: the robot is not stopped, or another node may command it.
         """
         if self.state != State.STOPPED:
             raise FollowerError(f"the robot is not stopped: {self.state}")
+        if self._other_publishers:
+            raise FollowerError(self._other_publishers)
         self.enabled = True
 
     def receive_robot_state(self, joints: tuple[str, ...], position: FloatArray, steady_ns: int) -> None:
@@ -330,6 +335,9 @@ class Follower:
         known = prediction.known
         fault = self._fatal(elapsed, steady_ns)
         fatal = bool(fault)
+        if fatal and not self.mapping.output.state_topic:
+            self.enabled = False
+            self._limiter.reset(self.mapping.home)
         fault = fault or self._fault(steady_ns, elapsed, prediction)
         self._refusal = ""
         self._jump[:] = 0.0

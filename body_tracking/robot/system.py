@@ -84,8 +84,7 @@ SYSTEM = System(
         Service(
             "robot_commands/enable",
             "robot_commands",
-            "an operator confirms that the robot is at `home` or where it was left, and may move; below the node's "
-            "own name",
+            "an operator confirms that the robot is at `home` and may move; below the node's own name",
         ),
     ),
 )

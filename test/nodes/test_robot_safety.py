@@ -141,7 +141,7 @@ class Robot:
             return self.follows() and abs(self.commands[-1] - self.angle) < 0.02
 
         for _ in range(3):
-            assert self.bench.until(lambda: arrived() or "themselves stood still" in self.said()), self.said()
+            assert self.bench.until(lambda: arrived() or not self.node.follower.enabled), self.said()
             if arrived():
                 return
             self.enable()

@@ -401,7 +401,7 @@ def test_foreign_angles_between_the_right_ones_are_not_overlooked() -> None:
 
 
 def test_another_publisher_of_the_commands_stops_at_once() -> None:
-    bench = following()
+    bench = following(state_topic=STATE_TOPIC)
     bench.follower.report_publishers("another publisher of /arm: /other")
     stopped = bench.run()
     assert (stopped.state, stopped.position) == (State.STOPPED, None)
@@ -420,6 +420,46 @@ def test_a_robot_without_state_topic_waits_for_a_person() -> None:
     bench.follower.enable()
     assert bench.run(3.0).state == State.FOLLOWING
     with pytest.raises(FollowerError, match="not stopped: following"):
+        bench.follower.enable()
+
+
+def another_publisher(bench: Bench) -> None:
+    bench.follower.report_publishers("another publisher of /arm: /other")
+    assert bench.run().state == State.STOPPED
+    bench.follower.report_publishers("")
+
+
+def gap(bench: Bench) -> None:
+    bench.elapsed_ns += round(2.1 * NANOSECONDS)
+    assert bench.run().state == State.STOPPED
+
+
+@pytest.mark.parametrize("fault", [another_publisher, gap])
+@pytest.mark.parametrize("before", [State.FOLLOWING, State.STOPPED])
+def test_a_robot_that_may_have_been_moved_waits_for_a_person_and_begins_at_home(
+    fault: Callable[[Bench], None], before: State
+) -> None:
+    bench = following(stop_after=0.5)
+    bench.mute = True  # without a state_topic
+    if before == State.STOPPED:
+        bench.silent = True
+        assert bench.run(1.0).state == State.STOPPED
+    fault(bench)
+    bench.silent = False
+    last = bench.run(3.0)
+    assert last.state == State.STOPPED and "waits for a person" in last.reason
+    bench.follower.enable()
+    begun = len(bench.commands)
+    assert bench.run(0.6).state == State.APPROACHING
+    first = next(each for each in bench.commands[begun:] if each.position is not None)
+    np.testing.assert_allclose(place(first), bench.follower.mapping.home, atol=1e-3)
+
+
+def test_nobody_enables_a_robot_that_another_node_commands() -> None:
+    bench = Bench()
+    bench.follower = Follower(mapping(), PERIOD)
+    bench.follower.report_publishers("another publisher of /arm: /other")
+    with pytest.raises(FollowerError, match="another publisher of /arm: /other"):
         bench.follower.enable()
 
 
