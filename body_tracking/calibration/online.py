@@ -147,13 +147,17 @@ class _Track:
     """The recent frames of one sensor, in ascending order of its own clock."""
 
     def __init__(self) -> None:
+        self.least_delay: int | None = None
+        self.late = 0
+        self.forget()
+
+    def forget(self) -> None:
+        """Drop all frames."""
         self.stamps: list[int] = []
         self.positions: list[FloatArray] = []
         self.states: list[np.ndarray] = []
         self.variances: list[FloatArray] = []
         self.delays: list[int] = []  # receipt minus stamp
-        self.least_delay: int | None = None
-        self.late = 0
 
     def push(self, skeleton: Skeleton, received_ns: int) -> str:
         """Keep a frame, unless the sensor's clock jumped since the last one: returns the direction, else ""."""
@@ -754,10 +758,15 @@ class OnlineCalibration:
     # --- services
 
     def start(self) -> str:
-        """Estimate anew from the next still pose; the present calibration stays in force until then."""
+        """Estimate anew from the next still pose; the present calibration stays in force until then.
+
+        Earlier frames are dropped: a sensor may have been moved since.
+        """
+        self._track.forget()
         for other in self._sensors.values():
             other.loaded = None
             other.forget()
+            other.track.forget()
             other.quality = SensorQuality()
         return "calibrating: stand still (a T-pose is best) for four seconds, then walk about"
 

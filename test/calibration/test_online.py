@@ -499,6 +499,28 @@ def test_services_start_anew_and_reset() -> None:
     assert calibration.status()[0] == 1
 
 
+@pytest.mark.parametrize("service", ["start", "reset"])
+def test_a_sensor_that_was_moved_is_calibrated_by_what_it_sees_since_the_request(service: str) -> None:
+    """Who moves a sensor asks for a calibration at once, while the frames from before are still stored."""
+    turn, shift = Rotation.from_euler("y", 20.0, degrees=True).as_matrix(), np.array([0.3, 0.0, 0.1])
+    frames = stream(26.0)
+    calibration = copy.deepcopy(_walked(15.0))
+    asked = False
+    for sensor, seen, received in frames[sum(received <= 15 * NANOSECONDS for _, _, received in frames) :]:
+        if sensor == "kinect2":
+            seen = replace(seen, positions=seen.positions @ turn.T + shift)
+        if received > 18 * NANOSECONDS and not asked:
+            asked = True
+            getattr(calibration, service)()
+        calibration.push(sensor, seen, received)
+        if 18.5 * NANOSECONDS < received < 20 * NANOSECONDS:
+            assert calibration.status()[1] != "calibrated"
+    rotation, translation = between(calibration.result())
+    expected = ROTATION @ turn.T
+    assert np.degrees(Rotation.from_matrix(rotation @ expected.T).magnitude()) < 1.0
+    assert_allclose(translation, TRANSLATION - expected @ shift, atol=0.03)
+
+
 def broken(frames: tuple[tuple[str, Skeleton, int], ...]) -> Iterator[tuple[str, Skeleton, int]]:
     """Repeated and reordered stamps, joints that are nowhere, untracked and absurd, and a sensor that pauses."""
     rng = np.random.default_rng(3)
