@@ -97,6 +97,9 @@ ESTIMATE_PERIOD = 1.0
 SLEW_ROTATION, SLEW_TRANSLATION = 0.05, 0.05
 """Fastest turn of a published pose toward a better one, rad/s, and fastest move at the person's place, m/s."""
 
+SAME_HEIGHT, SAME_TILT = 0.001, 0.001
+"""Metres and radians by which a saved pose of the reference sensor may differ from the parameters: they are rounded."""
+
 MAX_TRANSLATION_STDDEV = 0.05
 """Metres, at the person's place: greatest standard deviation of a good calibration."""
 
@@ -282,18 +285,18 @@ class OnlineCalibration:
             listed = ", ".join(sensors) or "(none)"
             raise CalibrationError(f"reference sensor {self.reference!r} is not among the sensors {listed}")
         self.events: list[str] = []
-        self._base = level_pose(
-            self.reference,
-            self.parameters.reference_height,
-            self.parameters.reference_pitch,
-            self.parameters.reference_roll,
-        )
+        self._base = self._given_base()
         self._track = _Track()
         self._sensors = {name: _Sensor() for name in sensors if name != self.reference}
         self._anchor: int | None = None
         self._now: int | None = None
         self._last_step: int | None = None
         self._changed = False
+
+    def _given_base(self) -> SensorPose:
+        """The reference sensor's pose by the parameters."""
+        given = self.parameters
+        return level_pose(self.reference, given.reference_height, given.reference_pitch, given.reference_roll)
 
     # --- frames in
 
@@ -726,6 +729,9 @@ class OnlineCalibration:
     def load(self, result: CalibrationResult) -> None:
         """Load an earlier calibration; it holds until there is a better estimate.
 
+        Its pose of the reference sensor defines ``world``, unless it contradicts parameters that are not 0: then they
+        do, and it moves as a whole.
+
         Its clocks count as independent of this session's motion: a calibration from the same recording makes the stated
         standard deviations of clocks too small, by up to the square root of two.
 
@@ -737,7 +743,7 @@ class OnlineCalibration:
                 f"the calibration's reference sensor is {result.reference!r}, this graph's is {self.reference!r}"
             )
         base = result.poses.get(self.reference, self._base)
-        self._base = base
+        self._base = self._world_of(base)
         for name, other in self._sensors.items():
             pose = result.poses.get(name)
             if pose is None:
@@ -755,6 +761,22 @@ class OnlineCalibration:
                 drift_stddev_ppm = min(clock.drift_stddev_ppm, 1e6 * DRIFT_PRIOR)
                 other.clock = other.loaded = replace(clock, drift_stddev_ppm=drift_stddev_ppm)
 
+    def _world_of(self, saved: SensorPose) -> SensorPose:
+        """The reference sensor's pose: the saved one, or the parameters' if they are given and contradict it."""
+        parameters, given = self.parameters, self._given_base()
+        if not (parameters.reference_height or parameters.reference_pitch or parameters.reference_roll):
+            return saved
+        higher = float(given.translation[2] - saved.translation[2])
+        # angle between the two directions of gravity in the sensor's coordinates, which has no heading
+        tilt = 2.0 * float(np.arcsin(min(1.0, 0.5 * float(np.linalg.norm(given.rotation[2] - saved.rotation[2])))))
+        if abs(higher) < SAME_HEIGHT and tilt < SAME_TILT:
+            return saved
+        self.events.append(
+            f"{self.reference}: reference_height, reference_pitch and reference_roll define world, not the saved "
+            f"calibration, which differs by {1e3 * abs(higher):.0f} mm and {np.degrees(tilt):.1f} deg"
+        )
+        return given
+
     # --- services
 
     def start(self) -> str:
@@ -771,7 +793,8 @@ class OnlineCalibration:
         return "calibrating: stand still (a T-pose is best) for four seconds, then walk about"
 
     def reset(self) -> str:
-        """Delete every calibration and start again."""
+        """Delete every calibration and start again, in the ``world`` of the parameters."""
+        self._base = self._given_base()
         for name, other in list(self._sensors.items()):
             fresh = _Sensor()
             fresh.track = other.track

@@ -91,6 +91,7 @@ class CalibrationStage(Stage):
             note = "" if values["save"] else ", not to be written"
             self.events.append(f"{self._file}: loaded{note}{lacking(loaded, sensors)}")
             self._exists = True
+            self._take_events()
         self._recorded, self._recorded_s = 0, 0.0
         """Frames in a row with stamps as in a recording, and seconds from the last one to the wall clock."""
         self._unsaved = self._saved = False
@@ -141,9 +142,12 @@ class CalibrationStage(Stage):
             subject = replace(subject, positions=np.full_like(subject.positions, np.nan))
         updates = self.calibration.push(sensor, subject, now.ros_ns)
         self._unsaved |= bool(updates)
+        self._take_events()
+        return self._published(updates)
+
+    def _take_events(self) -> None:
         self.events += self.calibration.events
         self.calibration.events.clear()
-        return self._published(updates)
 
     def _published(self, updates: Iterable[CalibrationUpdate]) -> Iterator[Output]:
         for update in updates:

@@ -23,8 +23,9 @@ from body_tracking.calibration.online import (
     OnlineCalibration,
 )
 from body_tracking.calibration.rigid import CalibrationError
+from body_tracking.core import so3
 from body_tracking.core.clocks import ClockModel
-from body_tracking.core.sensor_poses import CalibrationResult, SensorQuality
+from body_tracking.core.sensor_poses import CalibrationResult, SensorPose, SensorQuality, level_pose
 from body_tracking.core.skeleton import NANOSECONDS, FloatArray, Joint, Skeleton, TrackingState
 from body_tracking.kinect.csv_recording import CsvRecording
 from body_tracking.recording.calibrate import HISTORY_S, relative_yaw
@@ -68,6 +69,69 @@ def between(result: CalibrationResult) -> tuple[FloatArray, FloatArray]:
     """Rotation and translation that take kinect2's optical coordinates into kinect1's."""
     one, two = result.poses["kinect1"], result.poses["kinect2"]
     return one.rotation.T @ two.rotation, one.rotation.T @ (two.translation - one.translation)
+
+
+# --- world and a saved calibration
+
+
+def two_sensors(base: SensorPose) -> CalibrationResult:
+    """A calibration of two sensors half a right angle apart, the reference at ``base``."""
+    second = SensorPose("kinect2", base.apply(np.array([1.0, 0.1, 0.5])), so3.quat_multiply(base.quat_xyzw, TURN))
+    poses = {"kinect1": base, "kinect2": second}
+    quality = dict.fromkeys(poses, SensorQuality(0.05, 0.01, 0.004, 400))
+    return CalibrationResult("kinect1", poses, dict.fromkeys(poses, ClockModel()), quality)
+
+
+SAVED = {"reference_height": 1.2, "reference_pitch": 0.3, "reference_roll": -0.1}
+TURN = so3.exp(np.array([0.0, np.pi / 4.0, 0.0]))
+
+
+def test_a_saved_calibration_defines_world_where_no_parameter_does() -> None:
+    saved = two_sensors(level_pose("kinect1", *SAVED.values()))
+    calibration, _ = run((), saved=saved)
+    for name, pose in calibration.result().poses.items():
+        assert_allclose(pose.translation, saved.poses[name].translation, atol=1e-9)
+        assert_allclose(pose.rotation, saved.poses[name].rotation, atol=1e-9)
+    assert calibration.events == []
+
+
+@pytest.mark.parametrize("parameter", SAVED)
+def test_a_given_parameter_defines_world_and_moves_a_saved_calibration_as_a_whole(parameter: str) -> None:
+    saved = two_sensors(level_pose("kinect1", *SAVED.values()))
+    given = SAVED | {parameter: 0.6}
+    calibration, _ = run((), saved=saved, **given)
+    result = calibration.result()
+    expected = level_pose("kinect1", *given.values())
+    assert_allclose(result.poses["kinect1"].translation, expected.translation)
+    assert_allclose(result.poses["kinect1"].rotation, expected.rotation, atol=1e-12)
+    for found, before in zip(between(result), between(saved), strict=True):
+        assert_allclose(found, before, atol=1e-9)
+    (event,) = calibration.events
+    assert "reference_height, reference_pitch and reference_roll" in event
+
+
+def test_a_saved_world_that_agrees_with_the_parameters_keeps_its_origin_and_heading() -> None:
+    base = level_pose("kinect1", *SAVED.values())
+    moved = SensorPose(
+        "kinect1",
+        base.translation + [3.0, 2.0, 0.0],
+        so3.quat_multiply(so3.exp(np.array([0.0, 0.0, 2.0])), base.quat_xyzw),
+    )
+    calibration, _ = run((), saved=two_sensors(moved), **SAVED)
+    assert calibration.events == []
+    found = calibration.result().poses["kinect1"]
+    assert_allclose(found.translation, moved.translation)
+    assert_allclose(found.rotation, moved.rotation)
+
+
+@pytest.mark.parametrize("given", [{}, SAVED])
+def test_a_reset_returns_to_the_world_of_the_parameters(given: dict[str, float]) -> None:
+    calibration, _ = run((), saved=two_sensors(level_pose("kinect1", 2.0, 0.5)), **given)
+    calibration.reset()
+    (pose,) = calibration.result().poses.values()
+    expected = level_pose("kinect1", *given.values())
+    assert_allclose(pose.translation, expected.translation)
+    assert_allclose(pose.rotation, expected.rotation, atol=1e-12)
 
 
 # --- real sensors

@@ -150,6 +150,16 @@ def test_a_file_that_is_only_to_be_loaded_is_never_written(tmp_path: Path) -> No
     assert path.read_text() == before
 
 
+def test_a_file_that_the_parameters_contradict_is_named_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "room.yaml"
+    save(example(), path)
+    values = {each.name: each.default for each in CalibrationStage.PARAMETERS}
+    stage = CalibrationStage(values | {"calibration_file": str(path), "reference_height": 5.0})
+    loaded, contradicted = stage.events
+    assert loaded.startswith(f"{path}: loaded")
+    assert "not the saved calibration, which differs by" in contradicted
+
+
 def test_frames_that_waited_during_a_standstill_are_those_of_a_sensor(tmp_path: Path) -> None:
     path = tmp_path / "room.yaml"
     save(example(), path)
