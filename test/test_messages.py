@@ -23,13 +23,14 @@ from body_tracking.kinematics.upper_body import UpperBody
 from body_tracking.messages.angles import angles_to_joint_states, joint_state_values, joint_states_to_angles
 from body_tracking.messages.base import MessageError, MessageTypes
 from body_tracking.messages.cdr import encode_skeletons
-from body_tracking.messages.clouds import POSITION, make_cloud, read_cloud, record_of
+from body_tracking.messages.clouds import FLOAT32, POSITION, UINT8, UINT16, make_cloud, read_cloud, record_of
 from body_tracking.messages.codecs import Skeletons
 from body_tracking.messages.diagnostics import diagnostics, statuses
 from body_tracking.messages.imus import message_to_magnetic_field, message_to_sample, sample_to_messages
 from body_tracking.messages.model import joint_state_to_segments, segments_to_joint_state
 from body_tracking.messages.node_status import NodeStatus
 from body_tracking.messages.robots import command_to_array, command_to_trajectory
+from body_tracking.messages.skeletons import cloud_to_skeletons
 from body_tracking.recording.rosbag2 import BAG_MESSAGES, BAG_WIRE, deserialize, serialize
 from body_tracking.viewing.colours import INFERRED, PALETTE
 from body_tracking.viewing.markers import Markers
@@ -87,6 +88,19 @@ def test_the_covariance_of_a_joint_without_a_position_does_not_matter() -> None:
     states[Joint.HEAD] = 0
     (read,) = Skeletons().decode(encode_skeletons([replace(UPRIGHT, states=states, covariances=covariances)]), BAG_WIRE)
     assert read.covariances is not None
+
+
+FIELDS = (*POSITION, ("joint", UINT8), ("tracking_state", UINT8), ("body", UINT16))
+
+
+@pytest.mark.parametrize("field", ["xx", "zz", "vx", "vy"])
+def test_skeletons_with_a_part_of_a_covariance_or_a_velocity_are_refused_by_field(field: str) -> None:
+    fields = (*FIELDS, (field, FLOAT32))
+    points = np.zeros(N_JOINTS, record_of(fields))
+    points["joint"] = np.arange(N_JOINTS)
+    cloud = make_cloud(points, fields, 1, "kinect1_optical_frame", BAG_MESSAGES)
+    with pytest.raises(MessageError, match=f"only the fields {field}"):
+        cloud_to_skeletons(cloud)
 
 
 # --- angles, commands, states of nodes

@@ -18,7 +18,7 @@ from body_tracking.markers.codecs import SpacePoints
 from body_tracking.markers.messages import MAX_POINTS
 from body_tracking.markers.trajectories import DEFAULT_NOISE, EMPTY, FAR, FRAME, points_of
 from body_tracking.messages.base import MessageError, to_nanoseconds
-from body_tracking.messages.clouds import COVARIANCE, POSITION, columns, covariance_of, read_cloud
+from body_tracking.messages.clouds import COVARIANCE, POSITION, columns, covariance_of, has, read_cloud
 from body_tracking.messages.codecs import Codec, Wire
 from body_tracking.pipeline.shared import RELIABLE as TRANSPORT
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
@@ -63,11 +63,8 @@ def from_cloud(cloud: Any) -> ForeignPoints:
             positive definite.
     """
     rows = read_cloud(cloud, dict(POSITION + COVARIANCE), [name for name, _ in POSITION], MAX_POINTS)
-    positions, there = columns(rows, "xyz"), [name for name, _ in COVARIANCE if name in (rows.dtype.names or ())]
-    covariance = None
-    if there:
-        if len(there) < len(COVARIANCE):
-            raise MessageError(f"of a covariance only the fields {', '.join(there)}")
+    positions, covariance = columns(rows, "xyz"), None
+    if has(rows, COVARIANCE):
         covariance = covariance_of(rows)
         finite = np.isfinite(positions).all(axis=1)
         known = covariance[finite]

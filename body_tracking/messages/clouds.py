@@ -102,6 +102,18 @@ def _described(cloud: Any, wanted: Mapping[str, int], needed: Sequence[str]) -> 
     return np.dtype({"names": [*found], "formats": formats, "offsets": offsets, "itemsize": step})
 
 
+def has(points: Any, fields: Fields) -> bool:
+    """Whether an array of records has these optional fields, such as :data:`COVARIANCE`.
+
+    Raises:
+        MessageError: it has only some of them.
+    """
+    there = [name for name, _ in fields if name in points.dtype.names]
+    if there and len(there) < len(fields):
+        raise MessageError(f"of {', '.join(name for name, _ in fields)} only the fields {', '.join(there)}")
+    return bool(there)
+
+
 def columns(points: Any, names: Sequence[str]) -> FloatArray:
     """(n, m) numbers of these fields."""
     return np.stack([points[name] for name in names], axis=1).astype(np.float64)

@@ -19,6 +19,7 @@ from body_tracking.messages.clouds import (
     Fields,
     columns,
     covariance_of,
+    has,
     make_cloud,
     put_covariance,
     read_cloud,
@@ -62,8 +63,8 @@ def cloud_to_skeletons(cloud: Any) -> tuple[Skeleton, ...]:
     Joints may come in any order; unknown fields are ignored.
 
     Raises:
-        MessageError: fields missing or of another type, big-endian data, sizes that contradict each other, no
-            points, a joint missing, repeated or unknown, a tracking state above 2.
+        MessageError: fields missing or of another type, only a part of a covariance or a velocity, big-endian data,
+            sizes that contradict each other, no points, a joint missing, repeated or unknown, a tracking state above 2.
     """
     points = read_cloud(
         cloud, dict(_FIELDS + COVARIANCE + _VELOCITY), [name for name, _ in _FIELDS], N_JOINTS * MAX_BODIES
@@ -78,7 +79,7 @@ def cloud_to_skeletons(cloud: Any) -> tuple[Skeleton, ...]:
     if (points["joint"] != np.arange(N_JOINTS)).any() or (points["body"] != points["body"][:, :1]).any():
         raise MessageError(f"a joint is missing, repeated or above {N_JOINTS - 1}")
     stamp_ns, frame_id = to_nanoseconds(cloud.header.stamp), str(cloud.header.frame_id)
-    names = points.dtype.names or ()
+    covariances, velocities = has(points, COVARIANCE), has(points, _VELOCITY)
     return tuple(
         Skeleton(
             stamp_ns,
@@ -86,8 +87,8 @@ def cloud_to_skeletons(cloud: Any) -> tuple[Skeleton, ...]:
             columns(row, ("x", "y", "z")),
             row["tracking_state"].copy(),
             int(row["body"][0]),
-            covariance_of(row) if "xx" in names else None,
-            columns(row, ("vx", "vy", "vz")) if "vx" in names else None,
+            covariance_of(row) if covariances else None,
+            columns(row, ("vx", "vy", "vz")) if velocities else None,
         )
         for row in points
     )

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import traceback
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 from body_tracking.core.clocks import jumped_back
@@ -36,7 +38,7 @@ class OfflineRunner:
         published: topics that are not outputs of these stages.
 
     Attributes:
-        counters: inputs that could not be used, by topic.
+        counters: inputs that could not be used, by topic, and failures of the stages.
         reasons: by counter, why the first could not.
     """
 
@@ -60,6 +62,11 @@ class OfflineRunner:
                 self._inputs.setdefault(port.topic, []).append((number, stage, port))
 
     @property
+    def problems(self) -> tuple[str, ...]:
+        """The counters with their reasons, a line each."""
+        return tuple(f"{what}: {self.counters[what]}, the first: {why}" for what, why in self.reasons.items())
+
+    @property
     def outputs(self) -> tuple[Port, ...]:
         """The outputs of all stages."""
         return tuple(port for ports in self._outputs for port in ports.values())
@@ -67,7 +74,7 @@ class OfflineRunner:
     def start(self, at_ns: int) -> None:
         """Publish the outputs that the stages have before the first message."""
         for number, stage in enumerate(self._stages):
-            self._publish(number, stage.start(Now(at_ns, at_ns)), at_ns)
+            self._publish(self._encoded(number, stage.start(Now(at_ns, at_ns))), at_ns)
         self._deliver(at_ns)
 
     def push(self, topic: str, cdr: bytes, at_ns: int) -> None:
@@ -79,7 +86,7 @@ class OfflineRunner:
     def finish(self, at_ns: int) -> None:
         """Publish the outputs that still wait for later messages."""
         for number, stage in enumerate(self._stages):
-            self._publish(number, stage.drain(), at_ns)
+            self._publish(self._guarded(number, "what waited", stage.drain), at_ns)
             self._deliver(at_ns)
 
     def _poll(self, at_ns: int) -> None:
@@ -87,7 +94,7 @@ class OfflineRunner:
         for number, stage in enumerate(self._stages):
             due_ns = stage.deadline_ns if stage.deadline_ns is not None else stage.due_ns
             if due_ns is not None and due_ns <= at_ns:
-                self._guarded(number, stage, "what waited", stage.poll, at_ns, at_ns=at_ns)
+                self._publish(self._guarded(number, "what waited", stage.poll, at_ns), at_ns)
                 self._deliver(at_ns)
 
     def _deliver(self, at_ns: int) -> None:
@@ -96,48 +103,59 @@ class OfflineRunner:
         while self._queue:
             topic, cdr = self._queue.popleft()
             decoded: dict[type, Any] = {}
-            malformed = False
+            counted = False
             for number, stage, port in self._inputs.get(topic, ()):
                 kind = type(port.codec)
                 if kind not in decoded:
                     try:
                         decoded[kind] = port.codec.decode(cdr, self._wire)
-                    except BodyTrackingError as error:
-                        if not malformed:
-                            self._count(f"malformed {topic}", error)
-                        malformed = True
-                        stage.refused(topic)
+                    except Exception as error:
+                        if not counted:
+                            self._count(topic, error, "malformed")
+                        counted = True
+                        if isinstance(error, BodyTrackingError):
+                            stage.refused(topic)
                         continue
-                payload = decoded[kind]
-                self._reset_where_time_jumped(number, stage, port, payload)
-                self._guarded(number, stage, topic, stage.take, topic, payload, now, at_ns=at_ns)
-                self._guarded(number, stage, "what waited", stage.poll, at_ns, at_ns=at_ns)
+                taken = self._guarded(number, topic, self._take, number, stage, port, decoded[kind], now)
+                self._publish(taken, at_ns)
+                self._publish(self._guarded(number, "what waited", stage.poll, at_ns), at_ns)
+
+    def _take(self, number: int, stage: Stage, port: Port, payload: Any, now: Now) -> Iterable[Output]:
+        """Pass a message to a stage, which is reset before if the stamps jumped back."""
+        stamp_ns, key = port.codec.stamp_ns(payload), (port.topic, number)
+        if stamp_ns is not None:
+            if jumped_back(stamp_ns, self._last_ns.get(key)):
+                stage.reset(port.topic)
+            self._last_ns[key] = stamp_ns
+        return stage.take(port.topic, payload, now)
 
     def _guarded(
-        self, number: int, stage: Stage, where: str, call: Callable[..., Iterable[Output]], *given: Any, at_ns: int
-    ) -> None:
+        self, number: int, where: str, call: Callable[..., Iterable[Output]], *given: Any
+    ) -> Iterator[tuple[str, bytes]]:
+        """The messages of a call of a stage; an error ends them and is counted, as in a node."""
         try:
-            self._publish(number, call(*given), at_ns)
-        except BodyTrackingError as error:
-            self._count(f"refused {where}", error)
+            yield from self._encoded(number, call(*given))
+        except Exception as error:
+            self._count(where, error, "refused")
 
-    def _count(self, what: str, error: BodyTrackingError) -> None:
-        self.counters[what] += 1
-        self.reasons.setdefault(what, str(error))
+    def _count(self, where: str, error: Exception, what: str) -> None:
+        """Count an error, under ``what`` if it is one of ours, else as a failure."""
+        if isinstance(error, BodyTrackingError):
+            key, reason = f"{what} {where}", str(error)
+        else:
+            *_, place = traceback.extract_tb(error.__traceback__)
+            key = f"failed {where}"
+            reason = f"{type(error).__name__}: {error} ({Path(place.filename).name}, line {place.lineno})"
+        self.counters[key] += 1
+        self.reasons.setdefault(key, reason)
 
-    def _reset_where_time_jumped(self, number: int, stage: Stage, port: Port, payload: Any) -> None:
-        stamp_ns = port.codec.stamp_ns(payload)
-        if stamp_ns is None:
-            return
-        key = port.topic, number
-        if jumped_back(stamp_ns, self._last_ns.get(key)):
-            stage.reset(port.topic)
-        self._last_ns[key] = stamp_ns
-
-    def _publish(self, number: int, outputs: Iterable[Output], at_ns: int) -> None:
+    def _encoded(self, number: int, outputs: Iterable[Output]) -> Iterator[tuple[str, bytes]]:
         for output in outputs:
             port = self._outputs[number][output.topic]
             if not port.optional:
-                cdr = port.codec.encode(output.payload, self._wire)
-                self._sink(output.topic, cdr, at_ns)
-                self._queue.append((output.topic, cdr))
+                yield output.topic, port.codec.encode(output.payload, self._wire)
+
+    def _publish(self, messages: Iterable[tuple[str, bytes]], at_ns: int) -> None:
+        for topic, cdr in messages:
+            self._sink(topic, cdr, at_ns)
+            self._queue.append((topic, cdr))

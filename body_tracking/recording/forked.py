@@ -179,8 +179,7 @@ class Last:
 def problems_of(stages: Mapping[str, Stage], runner: OfflineRunner, at_ns: int) -> tuple[str, ...]:
     """What is wrong in stages, by node, at a time, and with their inputs, in words."""
     states = {node: stage.state(at_ns) for node, stage in stages.items()}
-    unusable = (f"{what}: {runner.counters[what]}, the first: {why}" for what, why in runner.reasons.items())
-    return (*(f"{node}: {text}" for node, (level, text, _) in states.items() if level and text), *unusable)
+    return (*(f"{node}: {text}" for node, (level, text, _) in states.items() if level and text), *runner.problems)
 
 
 def _is_last(executable: str) -> bool:

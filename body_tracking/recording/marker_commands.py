@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -113,6 +114,8 @@ def track(
             progress.at(raw.log_time_ns)
         runner.finish(bag.end_ns)
         progress.end()
+    for problem in runner.problems:
+        print(f"warning: {problem}", file=sys.stderr)
     return found
 
 

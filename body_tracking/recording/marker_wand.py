@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -124,6 +125,8 @@ def read_wand(path: Path, cameras: Sequence[Camera], wand: Wand) -> WandRecordin
             (runner.push if chosen == topics[0] else take)(raw.topic, raw.cdr, raw.log_time_ns)
             progress.at(raw.log_time_ns)
         progress.end()
+    for problem in runner.problems:
+        print(f"warning: {problem}", file=sys.stderr)
     found.extend(sets.poll(bag.end_ns + 2 * NANOSECONDS))
     chosen_sets = np.unique(np.linspace(0, len(found) - 1, min(_VIEWS, len(found))).round().astype(int)).tolist()
     rows = [

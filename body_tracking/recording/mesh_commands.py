@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
@@ -74,6 +75,8 @@ def personalise(bag_path: Path, camera: str, out: Path) -> str:
             if sensor.counters["personalisations"]:
                 break
         progress.end()
+    for problem in runner.problems:
+        print(f"warning: {problem}", file=sys.stderr)
     if not sensor.counters["personalisations"]:
         counted = ", ".join(f"{name}: {count}" for name, count in sorted(sensor.counters.items()))
         raise MeshCommandError(f"{bag_path}: too few different poses of a person, or nobody was tracked ({counted})")
