@@ -84,6 +84,17 @@ def test_no_message_ends_a_run(word: bytes, before: list[bytes], counter: str, r
     assert runner.reasons[counter].startswith(reason)
 
 
+def test_errors_in_a_row_restart_a_stage() -> None:
+    stage = Echo()
+    restarts: list[int] = []
+    stage.restart = lambda: restarts.append(number)  # type: ignore[method-assign]
+    runner = OfflineRunner([stage], BAG_WIRE, lambda topic, cdr, at_ns: None)
+    for number, word in enumerate([b"take"] * 9 + [b"one"] + [b"take"] * 21):
+        runner.push("/in", word, number)
+    assert restarts == [19, 29]
+    assert runner.counters == {"failed /in": 30}
+
+
 def test_an_output_that_cannot_be_written_ends_a_run() -> None:
     def full(topic: str, cdr: bytes, at_ns: int) -> None:
         raise OSError("disk full")

@@ -313,7 +313,7 @@ class OnlineCalibration:
         """
         if sensor == self.reference:
             if way := self._track.push(skeleton, received_ns):
-                self._restart(f"the clock of {sensor} went {way}: starting again from the calibration so far")
+                self.restart(f"the clock of {sensor} went {way}: starting again from the calibration so far")
                 self._track.push(skeleton, received_ns)
             return self._advance(skeleton.stamp_ns)
         other = self._sensors.get(sensor)
@@ -325,7 +325,8 @@ class OnlineCalibration:
             other.track.push(skeleton, received_ns)
         return []
 
-    def _restart(self, event: str) -> None:
+    def restart(self, event: str) -> None:
+        """Estimate anew, from the calibration so far; ``event`` says why."""
         self.events.append(event)
         self._track = _Track()
         self._anchor = self._now = self._last_step = None

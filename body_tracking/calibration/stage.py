@@ -165,6 +165,10 @@ class CalibrationStage(Stage):
         for subject in self._subjects.values():
             subject.reset()
 
+    def restart(self) -> None:
+        super().restart()
+        self.calibration.restart("errors in a row: starting again from the calibration so far")
+
     def _check_size(self, sensor: str, skeleton: Skeleton) -> None:
         """Count the frames in a row in which a person has an impossible size."""
         upper, lower = skeleton.positions[[Joint.SPINE_SHOULDER, Joint.SPINE_BASE]]

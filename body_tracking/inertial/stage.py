@@ -136,6 +136,11 @@ class ImuStage(Stage):
         elif topic in self._mags:
             self._refused[f"refused fields of {self._mags[topic]}"] += 1
 
+    def restart(self) -> None:
+        """The tracker detects jumps of time itself."""
+        super().restart()
+        self.tracker.reset()
+
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
         """Problems by sensor, counters, and standard deviations of the alignments."""
         problems = self.tracker.problems(ros_ns)

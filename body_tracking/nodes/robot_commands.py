@@ -173,7 +173,7 @@ class RobotCommands(GraphNode):
             found.remove(self.get_fully_qualified_name())
         return f"another publisher of {topic}: {', '.join(found)}"
 
-    def time_jumped_back(self, topic: str) -> None:
+    def restart(self) -> None:
         self.pairs.clear()
         self.follower.time_jumped_back()
 

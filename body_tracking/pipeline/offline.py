@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -11,7 +12,7 @@ from typing import Any
 from body_tracking.core.clocks import jumped_back
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.messages.codecs import Wire
-from body_tracking.pipeline.stage import Now, Output, Port, Stage
+from body_tracking.pipeline.stage import FAILURES, Now, Output, Port, Stage
 
 _LOOKS = 2
 """Looks at the same topics after which a stage changes its inputs."""
@@ -54,6 +55,7 @@ class OfflineRunner:
         self._stages, self._wire, self._sink = stages, wire, sink
         self._queue: deque[tuple[str, bytes]] = deque()
         self._last_ns: dict[tuple[str, int], int] = {}
+        self._failed_in_a_row: Counter[tuple[str, int]] = Counter()
         connect(stages, published)
         self._outputs = [{port.topic: port for port in stage.outputs} for stage in stages]
         self._inputs: dict[str, list[tuple[int, Stage, Port]]] = {}
@@ -110,10 +112,11 @@ class OfflineRunner:
                     try:
                         decoded[kind] = port.codec.decode(cdr, self._wire)
                     except Exception as error:
+                        ours = isinstance(error, BodyTrackingError)
                         if not counted:
-                            self._count(topic, error, "malformed")
+                            self._count(topic, error, "malformed" if ours else "failed")
                         counted = True
-                        if isinstance(error, BodyTrackingError):
+                        if ours:
                             stage.refused(topic)
                         continue
                 taken = self._guarded(number, topic, self._take, number, stage, port, decoded[kind], now)
@@ -135,19 +138,24 @@ class OfflineRunner:
         """The messages of a call of a stage; an error ends them and is counted, as in a node."""
         try:
             yield from self._encoded(number, call(*given))
-        except Exception as error:
+        except BodyTrackingError as error:
             self._count(where, error, "refused")
+        except Exception as error:
+            self._count(where, error, "failed")
+            self._failed_in_a_row[where, number] += 1
+            if self._failed_in_a_row[where, number] % FAILURES == 0:
+                with contextlib.suppress(Exception):
+                    self._stages[number].restart()
+        else:
+            self._failed_in_a_row.pop((where, number), None)
 
     def _count(self, where: str, error: Exception, what: str) -> None:
-        """Count an error, under ``what`` if it is one of ours, else as a failure."""
-        if isinstance(error, BodyTrackingError):
-            key, reason = f"{what} {where}", str(error)
-        else:
+        reason = str(error)
+        if not isinstance(error, BodyTrackingError):
             *_, place = traceback.extract_tb(error.__traceback__)
-            key = f"failed {where}"
-            reason = f"{type(error).__name__}: {error} ({Path(place.filename).name}, line {place.lineno})"
-        self.counters[key] += 1
-        self.reasons.setdefault(key, reason)
+            reason = f"{type(error).__name__}: {reason} ({Path(place.filename).name}, line {place.lineno})"
+        self.counters[f"{what} {where}"] += 1
+        self.reasons.setdefault(f"{what} {where}", reason)
 
     def _encoded(self, number: int, outputs: Iterable[Output]) -> Iterator[tuple[str, bytes]]:
         for output in outputs:

@@ -14,6 +14,9 @@ from body_tracking.core.parameters import Parameter, Value
 from body_tracking.core.qos import Qos
 from body_tracking.messages.codecs import Codec
 
+FAILURES = 10
+"""Consecutive unexpected errors of one input, or of what waits, after which the host restarts the stage."""
+
 
 class Now(NamedTuple):
     """When a message arrived.
@@ -148,6 +151,11 @@ class Stage:
 
     def reset(self, topic: str) -> None:
         """Forget the state, because the stamps of an input jumped back."""
+
+    def restart(self) -> None:
+        """Forget the state, because it may be the cause of :data:`FAILURES` errors in a row."""
+        for port in self.inputs:
+            self.reset(port.topic)
 
     def look(self, published: Callable[[str], bool]) -> bool:
         """Choose the inputs among the published topics; returns whether :attr:`inputs` have changed."""

@@ -187,8 +187,8 @@ class StageNode(GraphNode):
     def finish(self) -> None:
         self.publish(self.stage.drain())
 
-    def time_jumped_back(self, topic: str) -> None:
-        self.stage.reset(topic)
+    def restart(self) -> None:
+        self.stage.restart()
 
     def state(self) -> tuple[int, str, dict[str, object]]:
         level, text, values = self.stage.state(self.now_ns())

@@ -43,7 +43,7 @@ from body_tracking.messages.base import MessageError, to_nanoseconds
 from body_tracking.messages.diagnostics import diagnostics
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.shared import skeleton_input
-from body_tracking.pipeline.stage import Port
+from body_tracking.pipeline.stage import FAILURES, Port
 from body_tracking.ros.backlog import Backlog, Sequences, Standstill
 from body_tracking.ros.bag_topics import to_profile
 from body_tracking.ros.declare import declare
@@ -70,8 +70,6 @@ _LOOK_S = 0.2
 """Seconds between two checks whether to report."""
 _NAMELESS = "_NODE_NAME_UNKNOWN_"
 """What rclpy calls a publisher whose node is no longer known."""
-_FAILURES = 10
-"""Consecutive failed callbacks of one input after which the node resets its state."""
 _STATE_LEVELS = ("OK", "warning", "error", "stale")
 _SIMULATED = Parameter("use_sim_time", False, "whether the node's time is /clock")
 
@@ -316,10 +314,10 @@ class GraphNode(BatchNode):
         if self._may_log(key):
             trace = "".join(traceback.format_exception(error))
             self.get_logger().error(f"{where}: {kind} in a callback; message skipped: {error}\n{trace}")
-        if self._failed_in_a_row[where] % _FAILURES == 0:
-            self.log_throttled(f"anew {where}", f"{where}: failed {_FAILURES} times in a row; resetting")
+        if self._failed_in_a_row[where] % FAILURES == 0:
+            self.log_throttled(f"anew {where}", f"{where}: failed {FAILURES} times in a row; resetting")
             with contextlib.suppress(Exception):
-                self.time_jumped_back(where)
+                self.restart()
 
     def create_subscription(self, msg_type: Any, topic: str, callback: Any, *given: Any, **named: Any) -> Subscription:
         """As rclpy's, with a guarded callback."""
@@ -400,7 +398,7 @@ class GraphNode(BatchNode):
         return self.create_subscription(kind, topic if absolute else names.relative(topic), checked, qos, raw=raw)
 
     def subscribe_to_skeletons(self, topic: str, handle: Callable[[tuple[Skeleton, ...], int], None]) -> Subscription:
-        """Subscribe to a skeleton topic; a backward jump of its stamps calls :meth:`time_jumped_back` first.
+        """Subscribe to a skeleton topic; a backward jump of its stamps calls :meth:`restart` first.
 
         Best effort also with ``reliable``, since a sensor of another package may publish so.
         """
@@ -412,7 +410,7 @@ class GraphNode(BatchNode):
             skeletons: tuple[Skeleton, ...] = port.codec.decode(cdr, WIRE)
             if self.monitor.message_in(topic, skeletons[0].stamp_ns):
                 self.log_jump(name)
-                self.time_jumped_back(topic)
+                self.restart()
             handle(skeletons, sent_ns)
 
         qos = replace(SENSOR_DATA, depth=max(port.qos.depth, port.waiting))
@@ -469,8 +467,8 @@ class GraphNode(BatchNode):
             self.monitor.totals["time jumps"] += 1
             self.log_throttled("jump", f"{topic}: time jumped back, resetting", period_s=1.0)
 
-    def time_jumped_back(self, topic: str) -> None:
-        """Reset the state, because the stamps of an input jumped back."""
+    def restart(self) -> None:
+        """Reset the state, because stamps jumped back, or because it may be the cause of failures in a row."""
 
     def send(self, publisher: Publisher, message: Any, stamp_ns: int | None = None, sent_ns: int | None = None) -> bool:
         """Publish and count; nothing is published if the input became stale by a standstill of the process.

@@ -150,6 +150,20 @@ def test_a_file_that_is_only_to_be_loaded_is_never_written(tmp_path: Path) -> No
     assert path.read_text() == before
 
 
+def test_a_restart_keeps_the_poses_and_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "room.yaml"
+    save(example(), path)
+    values = {each.name: each.default for each in CalibrationStage.PARAMETERS}
+    stage = CalibrationStage(values | {"calibration_file": str(path), "sensors": ("kinect1", "kinect2")})
+    before = stage.calibration.result().poses
+    stage.restart()
+    list(stage.take("/kinect1/skeleton", [Skeleton(1, "kinect1_optical_frame", BODY, TRACKED)], Now(1, 1)))
+    assert "starting again from the calibration so far" in stage.events[-1]
+    for name, pose in stage.calibration.result().poses.items():
+        assert_allclose(pose.translation, before[name].translation)
+        assert_allclose(pose.rotation, before[name].rotation)
+
+
 def test_a_file_that_the_parameters_contradict_is_named_at_once(tmp_path: Path) -> None:
     path = tmp_path / "room.yaml"
     save(example(), path)

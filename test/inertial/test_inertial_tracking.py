@@ -21,6 +21,7 @@ from body_tracking.inertial.alignment import pose_rotations
 from body_tracking.inertial.mounting import mountings
 from body_tracking.inertial.parameters import TrackingParameters
 from body_tracking.inertial.simulated import Slip
+from body_tracking.inertial.stage import ImuStage
 from body_tracking.inertial.tracking import InertialTracker, InertialTrackingError, TrackerOutput
 from body_tracking.inertial.worn import ReceiptClock, WornSensor
 from body_tracking.simulation.scene import START_NS
@@ -310,6 +311,13 @@ def test_stamps_are_placed_by_the_cameras_own_frames_however_late_fused_ones_com
     # a sensor's reading of the same instant, which came 5 ms sooner
     assert (first[-1][0] - 5 * NANOSECONDS - 100 * NANOSECONDS) % (NANOSECONDS // 50) == 15_000_000
     assert without_frames[-1][0] == first[-1][0] - 30_000_000
+
+
+def test_a_restart_of_the_stage_begins_anew() -> None:
+    stage = ImuStage({each.name: each.default for each in ImuStage.PARAMETERS} | {"segments": ("forearm_left",)})
+    stage.tracker.aligned = True
+    stage.restart()
+    assert not stage.tracker.aligned
 
 
 def test_time_that_runs_backwards_begins_anew_and_is_counted() -> None:

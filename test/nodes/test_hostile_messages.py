@@ -38,7 +38,9 @@ from body_tracking.messages.skeletons import skeletons_to_cloud  # noqa: E402
 from body_tracking.pipeline import graph  # noqa: E402
 from body_tracking.recording.rosbag2 import BagReader  # noqa: E402
 from body_tracking.ros.executor import LeanExecutor  # noqa: E402
+from body_tracking.ros.host import node_of  # noqa: E402
 from body_tracking.ros.node import STEADY, GraphNode, RCLError  # noqa: E402
+from domains import domain  # noqa: E402
 from draws import draws  # noqa: E402
 
 ROS = RosMessages()
@@ -183,7 +185,7 @@ class Failing(GraphNode):
     PARAMETERS = ()
 
     def start(self) -> None:
-        self.restarts: list[str] = []
+        self.restarts = 0
         self.subscribe("/one", String, RELIABLE, self.on_one)
         self.create_timer(0.02, self.on_timer, clock=STEADY)
         self.create_service(Trigger, "~/ask", self.on_ask)
@@ -197,8 +199,8 @@ class Failing(GraphNode):
     def on_ask(self, request: Any, response: Any) -> Any:
         raise OSError("no disk")
 
-    def time_jumped_back(self, topic: str) -> None:
-        self.restarts.append(topic)
+    def restart(self) -> None:
+        self.restarts += 1
 
 
 def test_callback_errors_are_counted_by_input_and_kind(tmp_path: Path) -> None:
@@ -226,12 +228,36 @@ def test_callback_errors_are_counted_by_input_and_kind(tmp_path: Path) -> None:
         assert running.until(all_counted), counts
         assert all(counts[key] == str(wanted[key]) for key in wanted if "/one" in key)
         assert "callbacks failed" in counts[""]
-        # consecutive failures reset the node, because its state may be the cause
-        assert node.restarts.count("/one") == 1
         assert thread.is_alive()
         executor.stop()
         thread.join(10.0)
+        # ten failures of a callback in a row reset the node, because its state may be the cause
+        assert node.restarts == sum(count // 10 for count in node._failed_in_a_row.values())
+        assert node._failed_in_a_row["/one"] == 12
         rclpy.try_shutdown()
+
+
+@pytest.mark.parametrize("executable", ["fusion", "skeleton_filter", "mesh_tracker"])
+def test_ten_failures_in_a_row_reset_every_input_of_a_stage_in_any_namespace(
+    executable: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail() -> None:
+        raise ValueError("on purpose")
+
+    rclpy.init(args=["--ros-args", "-r", "__ns:=/lab"], domain_id=domain())
+    node = node_of(executable)()
+    resets: list[str] = []
+    monkeypatch.setattr(node.stage, "reset", resets.append)
+    for where in (node.full_name(node.stage.inputs[0].topic), "timer poll", "messages"):
+        guarded = node.guarded(where, fail)
+        for _ in range(9):
+            guarded()
+        assert resets == []
+        guarded()
+        assert resets == [port.topic for port in node.stage.inputs]
+        resets.clear()
+    node.destroy_node()
+    rclpy.try_shutdown()
 
 
 # --- files that rcl would read
