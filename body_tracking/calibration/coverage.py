@@ -76,11 +76,20 @@ class Coverage:
         crowded = np.flatnonzero(place.reshape(-1) == np.argmax(sizes))
         return int(crowded[np.argmin(self._order[crowded])])
 
-    def pairs(self) -> Pairs:
-        """All stored pairs."""
+    def pairs(self, since: float = -np.inf) -> Pairs:
+        """The stored pairs, of these elapsed seconds and later, in the order of their times."""
         n = self._count
-        points = self._points[:n]
-        return Pairs(points[:, 0], points[:, 1], self._variance[:n], len(np.unique(self._key[:n], axis=0)) if n else 0)
+        chosen = np.flatnonzero(self._elapsed[:n] >= since)
+        chosen = chosen[np.argsort(self._elapsed[chosen], kind="stable")]
+        points, places = self._points[chosen], len(np.unique(self._key[chosen], axis=0)) if len(chosen) else 0
+        return Pairs(points[:, 0], points[:, 1], self._variance[chosen], places)
+
+    def forget_before(self, elapsed: float) -> None:
+        """Drop the pairs of earlier elapsed seconds."""
+        kept = np.flatnonzero(self._elapsed[: self._count] >= elapsed)
+        for values in (self._key, self._order, self._elapsed, self._points, self._variance):
+            values[: len(kept)] = values[kept]
+        self._count = len(kept)
 
     def shift_clock(self, offset: float, drift: float) -> None:
         """Move the stored sensor frames along their velocity after a correction of the sensor's clock.

@@ -18,7 +18,7 @@ from body_tracking.calibration.advice import APART, ROUGH, WAITING
 from body_tracking.calibration.clock import LIKE, RECEIPT_PRIOR, correlate_clocks, joint_speeds
 from body_tracking.calibration.clock_correlation import DRIFT_PRIOR, FINE_RANGE, ClockFit
 from body_tracking.calibration.coverage import Coverage
-from body_tracking.calibration.pairwise import PairEstimate, Pairs, start_from_midline
+from body_tracking.calibration.pairwise import PairEstimate, Pairs, residual, shared_motion, start_from_midline
 from body_tracking.calibration.rigid import CalibrationError
 from body_tracking.calibration.still_pose import FRAMES, is_still, is_t_pose, still_pose_registration
 from body_tracking.calibration.turned import best_estimate, half_turn_from, registration
@@ -60,6 +60,18 @@ REBASE_CLOCK = 0.05
 
 MOVED_SIGMAS = 5.0
 """Standard deviations between estimate and saved pose or clock from which the saved one is dropped."""
+
+MOVED_WINDOW = 5.0
+"""Seconds of pairs that show whether a sensor has been moved."""
+
+MOVED_SHIFT, MOVED_RATIO = 0.1, 2.0
+"""A sensor has been moved if the pose by these pairs alone puts the person this many metres from where the pose by all
+pairs does, with a residual that is smaller by this factor. Of the 517 windows of nine real pairs of Kinects that stood
+still the greatest are 0.05 and 1.6; a turn by 10 degrees gives 0.5 and 10."""
+
+MOVED_MOTION = 0.8
+"""Least share of the motion in these pairs that both sensors see: they may see two people. Of one person who moves it
+is 0.83 to 0.99 (nine real pairs, lower quartiles)."""
 
 WANDER_PPM = 50.0
 """Standard deviation of a saved clock's change of drift, parts per million: quartz depends on the temperature."""
@@ -247,6 +259,7 @@ class _Sensor:
         self.paired_clock = self.clock
         self.pairs = Coverage(PAIRS_PER_PLACE, CAPACITY)
         self.paired_until: int | None = None
+        self.moved_ns: int | None = None  # pairs from before are of another pose
         self.started: tuple[FloatArray, FloatArray] | None = None
         self.next_estimate = 0
         self.estimated = False
@@ -262,6 +275,12 @@ def _clock_source(sensor: _Sensor) -> str:
 def _angle_between(a: FloatArray, b: FloatArray) -> float:
     """Radians between two rotations (3, 3)."""
     return float(np.linalg.norm(so3.rotation_vectors(a @ b.T)))
+
+
+def _difference(found: PairEstimate, rotation: FloatArray, translation: FloatArray) -> tuple[float, float]:
+    """Between an estimate and a pose: radians, and metres at the place of the person."""
+    place = rotation @ found.rotation.T @ (found.centre - found.translation) + translation
+    return _angle_between(found.rotation, rotation), float(np.linalg.norm(place - found.centre))
 
 
 class OnlineCalibration:
@@ -461,7 +480,7 @@ class OnlineCalibration:
 
     def _pair_anew(self, other: _Sensor, horizon: int) -> None:
         other.pairs.clear()
-        other.paired_until = None
+        other.paired_until = other.moved_ns
         other.paired_clock = other.clock
         self._pair(other, horizon)
 
@@ -597,6 +616,8 @@ class OnlineCalibration:
     def _estimate(self, name: str, other: _Sensor) -> None:
         if other.started is None or len(other.pairs) < 20:
             return
+        if other.estimated:
+            self._drop_pairs_before_a_move(name, other)
         pairs = other.pairs.pairs()
         best = self._best(pairs, other)
         if best is None:
@@ -609,7 +630,8 @@ class OnlineCalibration:
             if best.rotation_stddev > other.quality.rotation_stddev and not (moved and other.clock_locked):
                 return
             if moved:
-                apart, shift = self._difference(best, other)
+                assert other.rotation is not None
+                apart, shift = _difference(best, other.rotation, other.translation)
                 self.events.append(
                     f"{name}: does not stand where the saved calibration says, but {1e3 * shift:.0f} mm and "
                     f"{np.degrees(apart):.1f} deg away; estimated anew"
@@ -618,16 +640,35 @@ class OnlineCalibration:
         other.quality = SensorQuality(best.residual, best.rotation_stddev, best.translation_stddev, len(pairs))
         self._set_target(other, best.rotation, best.translation, best.centre)
 
-    @staticmethod
-    def _difference(found: PairEstimate, other: _Sensor) -> tuple[float, float]:
-        """Between the published pose and an estimate: radians, and metres at the place of the person."""
-        assert other.rotation is not None
-        place = other.rotation @ found.rotation.T @ (found.centre - found.translation) + other.translation
-        return _angle_between(found.rotation, other.rotation), float(np.linalg.norm(place - found.centre))
+    def _drop_pairs_before_a_move(self, name: str, other: _Sensor) -> None:
+        """Find out whether the sensor, or the reference, was moved: then only the last seconds' pairs count."""
+        assert other.started is not None and other.paired_until is not None and self._anchor is not None
+        end = (other.paired_until - self._anchor) / NANOSECONDS
+        recent = other.pairs.pairs(end - MOVED_WINDOW)
+        if not 20 <= len(recent) < len(other.pairs):
+            return
+        found = self._best(recent, other)
+        if found is None or shared_motion(recent, found.rotation) < MOVED_MOTION:
+            return
+        apart, shift = _difference(found, *other.started)
+        least = MOVED_RATIO * found.residual
+        earlier = recent.first(len(recent) // 2)  # if it was moved within this time, wait
+        if shift < MOVED_SHIFT or residual(recent, *other.started) < least:
+            return
+        if residual(earlier, found.rotation, found.translation) > least:
+            return
+        other.pairs.forget_before(end - MOVED_WINDOW)
+        other.moved_ns = other.paired_until - round(MOVED_WINDOW * NANOSECONDS)
+        other.started = found.rotation, found.translation
+        self.events.append(
+            f"{name} or {self.reference} was moved, by {1e3 * shift:.0f} mm at the person's place and "
+            f"{np.degrees(apart):.1f} deg; estimated anew"
+        )
 
     def _contradicts(self, found: PairEstimate, other: _Sensor) -> bool:
         """Whether published pose and estimate differ by more than their uncertainties explain."""
-        apart, shift = self._difference(found, other)
+        assert other.rotation is not None
+        apart, shift = _difference(found, other.rotation, other.translation)
         return bool(
             apart > MOVED_SIGMAS * np.hypot(found.rotation_stddev, other.quality.rotation_stddev)
             or shift > 0.05 + MOVED_SIGMAS * np.hypot(found.translation_stddev, other.quality.translation_stddev)

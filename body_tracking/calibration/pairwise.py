@@ -9,7 +9,8 @@ with the number of these.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -53,6 +54,12 @@ class Pairs:
 
     def __len__(self) -> int:
         return len(self.reference)
+
+    def first(self, count: int) -> Pairs:
+        """The first of them."""
+        return replace(
+            self, reference=self.reference[:count], sensor=self.sensor[:count], variance=self.variance[:count]
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,6 +111,35 @@ def same_sense(reference: FloatArray, sensor_in_reference: FloatArray) -> BoolAr
 def _same_sense(heading: FloatArray, other: FloatArray) -> BoolArray:
     same: BoolArray = np.einsum("ni,ni->n", heading, other) > 0.0
     return same
+
+
+def residual(pairs: Pairs, rotation: FloatArray, translation: FloatArray) -> float:
+    """Median distance between both sensors' positions of a joint at a pose, metres.
+
+    Args:
+        pairs: at least one, with a joint that both sensors see.
+        rotation: (3, 3) of the sensor in the reference's frame.
+        translation: (3,) metres.
+    """
+    apart = np.linalg.norm(pairs.reference - pairs.sensor @ rotation.T - translation, axis=2)
+    return float(np.median(apart[np.isfinite(pairs.variance)]))
+
+
+def shared_motion(pairs: Pairs, rotation: FloatArray) -> float:
+    """Share of the joints' motion in the reference sensor that the other one sees as well.
+
+    Near 1 where both see one person move, about 0 or less where they see different people, or one who stands still.
+
+    Args:
+        pairs: at least two.
+        rotation: (3, 3) of the sensor in the reference's frame.
+    """
+    known = np.isfinite(pairs.variance)
+    own, theirs = (np.where(known[..., None], each, np.nan) for each in (pairs.reference, pairs.sensor @ rotation.T))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of a joint that is in no pair
+        moved, seen = (each - np.nanmean(each, axis=0) for each in (own, theirs))
+    return 1.0 - float(np.nansum((moved - seen) ** 2) / max(float(np.nansum(moved**2)), 1e-12))
 
 
 def start_from_midline(pairs: Pairs) -> tuple[FloatArray, FloatArray] | None:

@@ -585,6 +585,65 @@ def test_a_sensor_that_was_moved_is_calibrated_by_what_it_sees_since_the_request
     assert_allclose(translation, TRANSLATION - expected @ shift, atol=0.03)
 
 
+def moved_by(seen: Skeleton, degrees: float) -> Skeleton:
+    """As a sensor sees it that was turned about the vertical, and pushed aside by 15 mm per degree."""
+    turn = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+    return replace(seen, positions=seen.positions @ turn.T + np.array([0.015, 0.0, 0.0]) * degrees)
+
+
+@pytest.mark.parametrize("which", ["kinect1", "kinect2"])
+@pytest.mark.parametrize("degrees", some([5.0, 20.0]))
+def test_a_sensor_that_is_moved_unnoticed_is_calibrated_anew(degrees: float, which: str) -> None:
+    """Nobody asks for a calibration after a kick at a tripod; the reference sensor may be the one."""
+    calibration, alarmed = OnlineCalibration(("kinect1", "kinect2")), 0
+    for sensor, seen, received in stream(32.0):
+        after = received > 15 * NANOSECONDS
+        calibration.push(sensor, moved_by(seen, degrees) if after and sensor == which else seen, received)
+        if [event for event in calibration.events if "was moved" in event]:
+            alarmed = alarmed or received
+    assert 15 * NANOSECONDS < alarmed < 27 * NANOSECONDS
+    turn = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+    expected = ROTATION @ turn.T if which == "kinect2" else turn @ ROTATION
+    assert np.degrees(Rotation.from_matrix(between(calibration.result())[0] @ expected.T).magnitude()) < 1.0
+
+
+@pytest.mark.parametrize("name", some(PAIRS))
+@pytest.mark.parametrize("degrees", some([4.0, 10.0]))
+def test_a_real_sensor_that_is_moved_is_calibrated_anew(shared_data: Path, name: str, degrees: float) -> None:
+    frames = recording(shared_data / "kinect_pairs" / f"{name}.csv.gz")
+    frames = frames[: round(0.8 * len(frames))]
+    middle_ns = frames[len(frames) // 2][2]
+    still, _ = run(frames)
+    assert not [event for event in still.events if "was moved" in event]
+    moved, _ = run(
+        (sensor, moved_by(seen, degrees) if sensor == "kinect2" and received > middle_ns else seen, received)
+        for sensor, seen, received in frames
+    )
+    assert [event for event in moved.events if "was moved" in event]
+    turn = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+    away = between(moved.result())[0] @ (between(still.result())[0] @ turn.T).T
+    assert np.degrees(Rotation.from_matrix(away).magnitude()) < 2.0
+
+
+@pytest.mark.parametrize("motion", ["another walk", "both stand still"])
+def test_a_sensor_that_sees_somebody_else_was_not_moved(motion: str) -> None:
+    """Who stands still could be the same body elsewhere: only a shared motion shows that a sensor was moved."""
+    calibration = copy.deepcopy(_walked(15.0))
+    before = between(calibration.result())[0]
+    still = {sensor: next(seen for each, seen, _ in stream(1.0) if each == sensor) for sensor in ("kinect1", "kinect2")}
+    backward = iter([seen for sensor, seen, _ in stream(27.0) if sensor == "kinect2"][::-1])
+    rng = np.random.default_rng(0)
+    for sensor, seen, received in stream(27.0)[900:]:
+        if motion == "both stand still":
+            positions = still[sensor].positions + (0.8 if sensor == "kinect2" else 0.0)
+            seen = replace(seen, positions=positions + rng.normal(scale=0.006, size=positions.shape))
+        elif sensor == "kinect2":
+            seen = replace(seen, positions=next(backward).positions)
+        calibration.push(sensor, seen, received)
+    assert not [event for event in calibration.events if "was moved" in event]
+    assert np.degrees(Rotation.from_matrix(between(calibration.result())[0] @ before.T).magnitude()) < 3.0
+
+
 def broken(frames: tuple[tuple[str, Skeleton, int], ...]) -> Iterator[tuple[str, Skeleton, int]]:
     """Repeated and reordered stamps, joints that are nowhere, untracked and absurd, and a sensor that pauses."""
     rng = np.random.default_rng(3)
