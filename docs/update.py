@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from body_tracking import cli, systems
-from body_tracking.core.parameters import Parameter, Value, grouped
+from body_tracking.core.parameters import Numbers, Parameter, Value, grouped, to_ros
 from body_tracking.core.qos import Qos
 from body_tracking.kinect import simulated as kinect
 from body_tracking.kinematics.conventions import ALL_CONVENTIONS, angle_names
@@ -162,6 +162,8 @@ def _default(value: Value) -> str:
         return f"`[{', '.join(value)}]`"
     if isinstance(value, float):
         return f"`{value!r}`"
+    if isinstance(value, Numbers):
+        return f"`{to_ros(value)}`"
     return f"`{value}`" if value != "" else '`""`'
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from body_tracking.core.parameters import (
+    Numbers,
     Parameter,
     ParameterError,
     as_yaml,
@@ -29,13 +31,18 @@ TABLE = (
     Parameter("mode", "fast", "how", choices=("fast", "slow")),
     Parameter("active", True, "whether"),
     Parameter("names", (), "who"),
+    Parameter("place", Numbers((0.0, 0.0, 1.0)), "where"),
 )
 
 
 def test_given_values_are_taken_and_others_default() -> None:
-    values = check_all(TABLE, {"gain": 2, "names": ["a", "", "b"]})
-    assert values == {"gain": 2.0, "count": 3, "mode": "fast", "active": True, "names": ("a", "b")}
+    values = check_all(TABLE, {"gain": 2, "names": ["a", "", "b"], "place": array("d", [1.0, -2.0, 0.5])})
+    expected = {"gain": 2.0, "count": 3, "mode": "fast", "active": True, "names": ("a", "b")}
+    assert values == {**expected, "place": Numbers((1.0, -2.0, 0.5))}
     assert type(values["gain"]) is float
+    # of whole numbers, as YAML has them, and once more
+    place = TABLE[5].check([1, 2, 3])
+    assert (TABLE[5].check(place), to_ros(place)) == (Numbers((1.0, 2.0, 3.0)), [1.0, 2.0, 3.0])
     # an empty list has a type in ROS
     assert (to_ros(()), to_ros(("a",))) == ([""], ["a"])
     assert TABLE[4].check(to_ros(())) == ()
@@ -57,6 +64,12 @@ def test_given_values_are_taken_and_others_default() -> None:
         ({"names": "a"}, "'names': 'a', expected a list of strings"),
         ({"names": ["a", 1]}, "expected a list of strings"),
         ({"gain": None}, "'gain': None, expected a number"),
+        ({"place": ["1", "2", "3"]}, "'place': ['1', '2', '3'], expected a list of 3 numbers"),
+        ({"place": [1.0, 2.0]}, "'place': [1.0, 2.0], expected a list of 3 numbers"),
+        ({"place": [1.0, 2.0, True]}, "expected a list of 3 numbers"),
+        ({"place": [1.0, 2.0, float("nan")]}, "expected a list of 3 numbers"),
+        ({"place": "1.0"}, "'place': '1.0', expected a list of 3 numbers"),
+        ({"place": None}, "'place': None, expected a list of 3 numbers"),
     ],
 )
 def test_values_that_are_not_allowed_are_refused_in_one_line(given_values: dict[str, object], said: str) -> None:

@@ -19,7 +19,7 @@ from body_tracking.camera.registration import Registration, is_registered, moved
 from body_tracking.camera.settings import DRIVER, MODEL, PEOPLE, SEARCH, THREADS, WAIT_NS, image_port, trackers_of
 from body_tracking.camera.topics import COMPRESSION, DRIVERS, CameraTopics, images_of
 from body_tracking.core.camera import Camera, CameraError
-from body_tracking.core.parameters import Parameter, Value
+from body_tracking.core.parameters import Numbers, Parameter, Value
 from body_tracking.core.qos import LATCHED
 from body_tracking.core.repeats import REPEATED, Repeats
 from body_tracking.core.sensor_poses import SensorPose
@@ -32,7 +32,7 @@ from body_tracking.mesh.person import COVERED, is_covered
 from body_tracking.messages.codecs import CameraInfo, Skeletons
 from body_tracking.pipeline import graph
 from body_tracking.pipeline.shared import RELIABLE as TRANSPORT
-from body_tracking.pipeline.shared import names_in, skeleton_qos
+from body_tracking.pipeline.shared import skeleton_qos
 from body_tracking.pipeline.stage import Now, Output, Port, Stage
 
 CAMERA = Parameter("camera", "camera1", "name of the camera; the node publishes /<camera>/skeleton")
@@ -56,15 +56,17 @@ _COMPRESSED = Parameter(
 )
 _DEPTH_POSE = Parameter(
     "depth_pose",
-    (),
+    Numbers((0.0,) * 7),
     "pose of the depth camera in the colour camera's optical frame: x, y, z in metres and the quaternion x, y, z, w; "
-    "empty where the driver registers the depth images to the colour images",
+    "all 0 where the driver registers the depth images to the colour images",
 )
 _TOLERANCE = Parameter(
     "tolerance", 0.02, "largest difference between the stamps of a colour and a depth image of one time", "s", 0.0, 0.5
 )
 
 _COLOUR, _DEPTH = "colour", "depth"
+_ROUNDED = 0.02
+"""By which the length of a quaternion may differ from 1: its numbers may be written with one digit."""
 FLAT: Final = "the person is flat: a picture of one?"
 
 
@@ -91,7 +93,7 @@ class CameraStage(Stage):
         super().__init__(values, wanted)
         prepare()
         self._name = check_sensor_name(str(values["camera"]))
-        self._pose = _pose(names_in(values["depth_pose"]))
+        self._pose = _pose(values["depth_pose"])
         self._tracker = trackers_of(values)()
         self._pictures = Pictures(self._name, float(str(values["picture_rate"])), wanted)
         self._topics = topics = topics_of(self._name, values)
@@ -250,14 +252,13 @@ def topics_of(camera: str, values: Mapping[str, Value]) -> CameraTopics:
     return CameraTopics(**given).of(camera)
 
 
-def _pose(numbers: tuple[str, ...]) -> SensorPose | None:
-    """The value of the parameter ``depth_pose``; GraphError for another one."""
-    if not numbers:
+def _pose(given: Value) -> SensorPose | None:
+    """The value of the parameter ``depth_pose``; GraphError for one whose quaternion has another length than 1."""
+    assert isinstance(given, Numbers)
+    values = np.array(given.values)
+    if not values.any():
         return None
-    try:
-        values = np.array([float(each) for each in numbers])
-    except ValueError as error:
-        raise graph.GraphError(f"depth_pose: {error}") from error
-    if values.shape != (7,) or not np.isfinite(values).all() or not np.linalg.norm(values[3:]) > 0.5:
-        raise graph.GraphError(f"depth_pose: {', '.join(numbers)}; expected x, y, z and a unit quaternion x, y, z, w")
+    length = float(np.linalg.norm(values[3:]))
+    if abs(length - 1.0) > _ROUNDED:
+        raise graph.GraphError(f"depth_pose: the quaternion x, y, z, w has the length {length:.3g}, not 1")
     return SensorPose(_DEPTH, values[:3], values[3:])

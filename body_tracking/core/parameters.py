@@ -20,7 +20,15 @@ import yaml
 from body_tracking.core import files
 from body_tracking.core.errors import BodyTrackingError, did_you_mean, one_of
 
-Value: TypeAlias = bool | int | float | str | tuple[str, ...]
+
+@dataclass(frozen=True, slots=True)
+class Numbers:
+    """A list of numbers as the value of a parameter."""
+
+    values: tuple[float, ...]
+
+
+Value: TypeAlias = bool | int | float | str | tuple[str, ...] | Numbers
 
 SECTION = "ros__parameters"
 
@@ -35,7 +43,8 @@ class Parameter:
 
     Attributes:
         name: as in a parameters file.
-        default: its type is the parameter's type; a tuple is a list of strings, none of them empty.
+        default: its type is the parameter's type; a tuple is a list of strings, none of them empty, and
+            :class:`Numbers` one of as many finite numbers.
         doc: one line.
         unit: or empty.
         min: the least value, of a number.
@@ -58,6 +67,8 @@ class Parameter:
     @property
     def type_name(self) -> str:
         """The type in words."""
+        if isinstance(self.default, Numbers):
+            return f"a list of {len(self.default.values)} numbers"
         names = {bool: "true or false", int: "a whole number", float: "a number", str: "a string"}
         return names.get(type(self.default), "a list of strings")
 
@@ -111,6 +122,13 @@ class Parameter:
             if isinstance(value, list | tuple) and all(isinstance(item, str) for item in value):
                 return tuple(item for item in value if item)  # ROS has no empty lists: [""] is one
             return None
+        if isinstance(self.default, Numbers):
+            items = value.values if isinstance(value, Numbers) else value
+            if not isinstance(items, Sequence) or len(items) != len(self.default.values):
+                return None
+            if not all(isinstance(item, int | float) and not isinstance(item, bool) for item in items):
+                return None
+            return Numbers(tuple(float(item) for item in items)) if all(map(math.isfinite, items)) else None
         if isinstance(value, bool) or isinstance(self.default, bool):
             return value if isinstance(value, bool) and isinstance(self.default, bool) else None
         if isinstance(self.default, float) and isinstance(value, int | float):
@@ -304,8 +322,10 @@ def matches(pattern: str, node: str) -> bool:
     return match(0, 0)
 
 
-def to_ros(value: Value) -> bool | int | float | str | list[str]:
+def to_ros(value: Value) -> bool | int | float | str | list[str] | list[float]:
     """A value in ROS's types; an empty list, which has no type there, becomes ``[""]``."""
+    if isinstance(value, Numbers):
+        return list(value.values)
     return list(value) or [""] if isinstance(value, tuple) else value
 
 

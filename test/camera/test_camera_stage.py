@@ -15,7 +15,7 @@ from body_tracking.camera.settings import PEOPLE
 from body_tracking.camera.stage import CameraStage
 from body_tracking.camera.topics import COMPRESSED, COMPRESSED_DEPTH, people_topic
 from body_tracking.core.camera import Camera, CameraError
-from body_tracking.core.parameters import check_all
+from body_tracking.core.parameters import Numbers, check_all
 from body_tracking.core.skeleton import Joint, Skeleton, TrackingState
 from body_tracking.core.sources import SensorNameError
 from body_tracking.mesh.depth import DepthError
@@ -182,11 +182,11 @@ def test_depth_images_that_are_not_registered_are_refused_without_the_pose_of_th
     with pytest.raises(CameraError, match="not registered"):
         node.take(NAMES.depth_info, other, now(0))
     assert "depth_pose" in node.state(0)[1]
-    posed = stage(depth_pose=("0.02", "0", "0", "0", "0", "0", "1"))
+    posed = stage(depth_pose=[0.02, 0, 0, 0, 0, 0, 1.0])
     posed.take(NAMES.colour_info, recorded.colour_camera, now(0))
     posed.take(NAMES.depth_info, other, now(0))
     assert posed.state(0)[:2] == (0, "")
-    for wrong in (("1", "2"), ("0", "0", "0", "0", "0", "0", "0"), ("a",) * 7):
+    for wrong in ([0.02, 0, 0, 0, 0, 0, 0], [0.02, 0, 0, 0, 0, 0, 0.1]):
         with pytest.raises(GraphError, match="depth_pose"):
             stage(depth_pose=wrong)
 
@@ -261,11 +261,12 @@ def test_each_camera_has_a_node_with_parameters_of_its_own(tmp_path: Path) -> No
     file = tmp_path / "cameras.yaml"
     file.write_text(
         "/**: {ros__parameters: {search_every: 1.0}}\n"
-        "camera2_skeleton: {ros__parameters: {driver: orbbec, depth_pose: ['0.1', '0', '0', '0', '0', '0', '1']}}\n"
+        "camera2_skeleton: {ros__parameters: {driver: orbbec, depth_pose: [0.1, 0, 0, 0, 0, 0, 1]}}\n"
     )
     found = parameters_for(nodes_for(options_of(camera=("camera1", "camera2"))), file)
     drivers = [found[f"{name}_skeleton"].get("driver", "plain") for name in ("camera1", "camera2")]
     assert drivers == ["plain", "orbbec"]
+    assert found["camera2_skeleton"]["depth_pose"] == Numbers((0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
     assert "depth_pose" not in found["camera1_skeleton"]
     assert all(found[f"{name}_skeleton"]["search_every"] == 1.0 for name in ("camera1", "camera2"))
 

@@ -49,7 +49,7 @@ def test_images_become_skeletons_and_angles_with_deviations(tmp_path: Path) -> N
     [
         pytest.param(
             "camera_skeleton",
-            {"camera": "camera1", "driver": "realsense"},
+            {"camera": "camera1", "driver": "realsense", "depth_pose": "[-0.015, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]"},
             "/camera/camera1/color/image_raw",
             marks=pytest.mark.skipif(bool(MISSING), reason=REASON),
         ),
