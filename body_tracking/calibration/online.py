@@ -22,6 +22,7 @@ from body_tracking.calibration.pairwise import PairEstimate, Pairs, residual, sh
 from body_tracking.calibration.rigid import CalibrationError
 from body_tracking.calibration.still_pose import FRAMES, is_still, is_t_pose, still_pose_registration
 from body_tracking.calibration.turned import best_estimate, half_turn_from, registration
+from body_tracking.calibration.upright import Tilt
 from body_tracking.core import so3
 from body_tracking.core.clocks import JUMP_BACK_NS, ClockModel, jumped_back
 from body_tracking.core.measurement import joint_variance
@@ -99,6 +100,9 @@ CLOCK_CORRELATION, CLOCK_MARGIN = 0.6, 0.08
 
 PAIRS_PER_PLACE, CAPACITY = 20, 500
 """Stored pairs of frames per place and heading, and in all."""
+
+TILT_PERIOD_NS = 2 * NANOSECONDS
+"""Time between two still poses that show how the reference is tilted, nanoseconds."""
 
 SETTLE_NS = round(0.3 * NANOSECONDS)
 """Time to wait for late frames before they are paired, nanoseconds."""
@@ -311,6 +315,8 @@ class OnlineCalibration:
         self._now: int | None = None
         self._last_step: int | None = None
         self._changed = False
+        self._tilt = Tilt()
+        self._tilt_ns: int | None = None
 
     def _given_base(self) -> SensorPose:
         """The reference sensor's pose by the parameters."""
@@ -348,7 +354,7 @@ class OnlineCalibration:
         """Estimate anew, from the calibration so far; ``event`` says why."""
         self.events.append(event)
         self._track = _Track()
-        self._anchor = self._now = self._last_step = None
+        self._anchor = self._now = self._last_step = self._tilt_ns = None
         for other in self._sensors.values():
             other.track = _Track()
             other.forget()
@@ -364,6 +370,9 @@ class OnlineCalibration:
         for name, other in self._sensors.items():
             self._process(name, other, horizon)
         self._track.forget_before(now - round(self.parameters.history * NANOSECONDS))
+        if self._tilt_ns is None or now - self._tilt_ns >= TILT_PERIOD_NS:
+            self._tilt_ns = now
+            self._tilt.add(*self._track.until(now, FRAMES))
         if self._last_step is not None and now - self._last_step < PAIR_PERIOD * NANOSECONDS:
             return []
         elapsed = 0.0 if self._last_step is None else (now - self._last_step) / NANOSECONDS
@@ -659,6 +668,7 @@ class OnlineCalibration:
             return
         other.pairs.forget_before(end - MOVED_WINDOW)
         other.moved_ns = other.paired_until - round(MOVED_WINDOW * NANOSECONDS)
+        self._tilt = Tilt()
         other.started = found.rotation, found.translation
         self.events.append(
             f"{name} or {self.reference} was moved, by {1e3 * shift:.0f} mm at the person's place and "
@@ -827,6 +837,7 @@ class OnlineCalibration:
         Earlier frames are dropped: a sensor may have been moved since.
         """
         self._track.forget()
+        self._tilt = Tilt()
         for other in self._sensors.values():
             other.loaded = None
             other.forget()
@@ -880,4 +891,6 @@ class OnlineCalibration:
             return 1, f"{', '.join(uncertain)}: {ROUGH}", values
         if self._now is None and not self._sensors:
             return 1, f"no skeleton of {self.reference} yet", values
+        if tilted := self._tilt.problem(self.reference, self._base.rotation):
+            return 1, tilted, values
         return 0, "calibrated", values

@@ -54,7 +54,7 @@ def is_t_pose(positions: FloatArray) -> bool:
     return all(float(arm @ across) > 0.85 * float(np.linalg.norm(arm) * np.linalg.norm(across)) for arm in arms)
 
 
-def _average(positions: FloatArray, states: np.ndarray) -> tuple[FloatArray, BoolArray]:
+def average(positions: FloatArray, states: np.ndarray) -> tuple[FloatArray, BoolArray]:
     """Mean pose (25, 3), and which joints were Tracked in more than half of the frames."""
     tracked = (states == TrackingState.TRACKED) & np.isfinite(positions).all(axis=-1)
     count = tracked.sum(axis=0)
@@ -80,8 +80,8 @@ def still_pose_registration(
     Raises:
         CalibrationError: fewer than three joints tracked by both.
     """
-    target, target_known = _average(*reference)
-    source, source_known = _average(*sensor)
+    target, target_known = average(*reference)
+    source, source_known = average(*sensor)
     both = target_known & source_known
     if both.sum() < 3:
         raise CalibrationError(f"{both.sum()} joints are tracked by both sensors, at least 3 are needed")
