@@ -353,10 +353,11 @@ def angles_topics(specs: Iterable[NodeSpec], parameters: Mapping[str, Mapping[st
 
 
 CONFIG_HEADER = """\
-# Every parameter of every node at its default. Written by `make docs` from the code; copy it, keep what you change:
+# The parameters of the nodes at their defaults. Written by `make docs` from the code; copy it, keep what you change:
 #   body_tracking up --params-file my_parameters.yaml
 #   ros2 launch body_tracking two_kinects.launch.py params_file:=my_parameters.yaml
-# The command line, not the file, sets what connects the graph: names of sensors, the bag, simulated time.
+# Left out is what connects the graph, which the command line sets: names of sensors, setups, the robot's mapping, the
+# bag, simulated time; and skeleton_adapter, which stands in the place of the node of a sensor with another driver.
 # A section /** applies to all nodes that have the parameter. A first session may need those under "basic"; the defaults
 # of those under "advanced" fit nearly always.
 """

@@ -40,7 +40,7 @@ from body_tracking.viewing.shapes import ELLIPSOID_RADIUS, ellipsoids, figure, f
 
 UPRIGHT = Skeleton(1, "kinect1_optical_frame", np.ones((N_JOINTS, 3)), np.full(N_JOINTS, 2, dtype=np.uint8))
 POSSIBLE = {
-    "exact": np.zeros((3, 3)),
+    "zero": np.zeros((3, 3)),
     "isotropic": 4e-4 * np.eye(3),
     "of one direction": 1e-4 * np.ones((3, 3)),
     "known across its ray": 1e-6 * np.eye(3) + 1e-2 * np.outer([0.6, 0.0, 0.8], [0.6, 0.0, 0.8]),

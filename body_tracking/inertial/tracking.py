@@ -7,7 +7,8 @@ alignment and heading by a pose and by a camera's bones (``held_pose``, ``alignm
 Headings: with a camera, ``world`` is the camera's. Without one, x is where the person faced in the pose; the common
 part of all headings drifts, and the covariance grows with it.
 
-Over 500 lines: the inertial issue rewrites tracking and slips.
+Over 500 lines: one state machine over the estimators of the other modules; an alignment, a slip or an exchange of two
+sensors changes the headings of all.
 """
 
 from __future__ import annotations

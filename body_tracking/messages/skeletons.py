@@ -99,7 +99,9 @@ def checked_covariances(skeletons: tuple[Skeleton, ...]) -> tuple[Skeleton, ...]
 
     Raises:
         MessageError: the covariance of a joint that has a position has a negative variance, NaN, or correlations that
-            are impossible. A variance of zero says that it is exact.
+            are impossible. A variance of zero is possible, as of a position along a ray, but nothing takes a joint for
+            exact: :func:`~body_tracking.core.measurement.joint_variance` has a lower bound, and ``ekf`` puts its own
+            variance in the place of zeros.
     """
     if skeletons[0].covariances is None:
         return skeletons

@@ -15,7 +15,8 @@ from body_tracking.pipeline.stage import Port
 RELIABLE = Parameter(
     "reliable",
     False,
-    "reliable instead of best-effort transport of skeletons, so that none is lost; slower when a receiver hangs",
+    "lose nothing: skeletons and marker points come reliably instead of best effort, and no image or frame is left out "
+    "where a node is too slow or stood still; slower when a receiver hangs",
     fixed="a topic keeps the quality of service that it was made with",
 )
 WORLD_FRAME = Parameter(

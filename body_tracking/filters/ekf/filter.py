@@ -1,6 +1,7 @@
 """The extended filter: processes frames and orientations in the order of their stamps.
 
-Over 500 lines: the estimator's issue rewrites this folder.
+Over 500 lines: one estimator, whose start, order of stamps and replay of late measurements share its state; updates,
+priors and errors of sensors have modules of their own.
 """
 
 from __future__ import annotations
