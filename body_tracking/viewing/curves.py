@@ -39,6 +39,10 @@ _LIMB_GROUPS: Final = {
 }
 
 
+_OLD: Final = 2.0
+"""Seconds without a message from which an angle is shown as old."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Curve:
     """An angle over time.
@@ -57,14 +61,17 @@ class Curve:
     high: FloatArray
     latest_stddev: float
 
-    def latest(self) -> str:
+    def latest(self, age: float = 0.0) -> str:
         """The latest angle and half its band, to a tenth of a degree, or finer for a band that is narrower.
 
-        ``?`` stands for half a turn or more, which leaves no angle out.
+        ``?`` stands for half a turn or more, which leaves no angle out. Of an angle that has not come for ``age``
+        seconds, 2 or more, that time is shown in place of the band.
         """
         reach = BAND * self.latest_stddev
         decimals = next((each for each in range(1, _DECIMALS) if reach >= 10.0**-each), _DECIMALS)
         half = f"{reach:.{decimals}f}\u00b0" if reach < _HALF_TURN else "?"
+        if age >= _OLD:
+            return f"{self.values[-1]:.{decimals}f}\u00b0, {age:.0f} s ago"
         return f"{self.values[-1]:.{decimals}f}\u00b0 \u00b1 {half}"
 
 
@@ -119,6 +126,10 @@ class AngleHistory:
         self._rows.append((stamp_ns, np.degrees([positions, stddevs])))
         while self._rows[0][0] < stamp_ns - round(self.window * NANOSECONDS):
             self._rows.popleft()
+
+    def age(self, steady_ns: int) -> float:
+        """Seconds since the last message, at this time of the clock of :meth:`add`."""
+        return (steady_ns - self._received_ns) / NANOSECONDS
 
     def known(self) -> tuple[str, ...]:
         """Angles with a value and a standard deviation below ``UNKNOWN`` at any time in the window."""

@@ -326,7 +326,7 @@ class Page:
     def draw_curves(self, history: AngleHistory) -> None:
         """Show the chosen angles."""
         with self._server.atomic():
-            self._plots.draw(history)
+            self._plots.draw(history, history.age(time.monotonic_ns()))
 
     def draw_status(self, statuses: Mapping[str, NodeStatus], now: float) -> None:
         """Show the nodes' diagnostics, and the controls of nodes that report."""

@@ -42,8 +42,8 @@ class Plots:
         self._known: tuple[str, ...] = ()
         self._plots = [_Plot(gui, window) for _ in range(PLOTS)]
 
-    def draw(self, history: AngleHistory) -> None:
-        """Show the chosen angles."""
+    def draw(self, history: AngleHistory, age: float = 0.0) -> None:
+        """Show the chosen angles, which came last this many seconds ago."""
         known = history.known()
         # an angle that is lost stays in the lists until others come
         if not set(known) <= set(self._known) or set(self._known) - set(history.names):
@@ -62,7 +62,7 @@ class Plots:
                 plot.offer(self._known, own[place] if place < len(own) else "")
             self._shown = limb
         for plot in self._plots:
-            plot.draw(history)
+            plot.draw(history, age)
 
 
 class _Plot:
@@ -117,12 +117,12 @@ class _Plot:
         if chosen:
             self._choice.value = label_of(chosen)
 
-    def draw(self, history: AngleHistory) -> None:
-        """Show the chosen angle."""
+    def draw(self, history: AngleHistory, age: float) -> None:
+        """Show the chosen angle; its age in seconds."""
         curve = history.curve(self._names.get(self._choice.value, ""), POINTS)
         if curve is not None:
             self._plot.data = (curve.times, curve.values, curve.low, curve.high, widened(curve))
-            self._choice.label = curve.latest()
+            self._choice.label = curve.latest(age)
 
 
 def widened(curve: Curve) -> FloatArray:

@@ -135,6 +135,16 @@ def test_late_ones_are_left_out_and_a_jump_back_or_other_names_start_anew() -> N
     assert history.curve(NAMES[0], 100) is None
 
 
+def test_an_angle_that_no_longer_comes_is_shown_with_its_age() -> None:
+    """Its value would pass for the present one after the sensors have stopped."""
+    history = AngleHistory(10.0)
+    history.add(5, ("a",), np.radians([17.2]), np.radians([1.0]), steady_ns=7 * NANOSECONDS)
+    curve = history.curve("a", 100)
+    assert curve is not None and history.age(9 * NANOSECONDS) == pytest.approx(2.0)
+    assert curve.latest(1.9) == curve.latest() == "17.2° ± 2.0°"
+    assert curve.latest(history.age(29 * NANOSECONDS)) == "17.2°, 22 s ago"
+
+
 def test_an_angle_of_which_nothing_is_known_yet_has_no_curve() -> None:
     history = AngleHistory(10.0)
     assert history.curve(NAMES[0], 100) is None
