@@ -35,6 +35,23 @@ class Sensor:
         return found
 
 
+def test_errors_in_another_thread_end_no_report() -> None:
+    """``kinect_skeleton`` publishes in a thread of its own."""
+
+    class Where(str):
+        """A callback whose name is printed while another one fails."""
+
+        __slots__ = ()
+
+        def __format__(self, spec: str) -> str:
+            told.failures["timer ValueError"] += 1
+            return str(self)
+
+    told = Monitor()
+    told.failures[Where("frames ValueError")] += 1
+    assert told.values()["raised frames ValueError"] == 1
+
+
 @pytest.mark.parametrize("speed", [0.1, 0.25, 1.0, 7.0])
 def test_rate_of_a_bag_is_per_second_of_its_time(monkeypatch: pytest.MonkeyPatch, speed: float) -> None:
     assert Sensor(monkeypatch).reports(30, speed)[3:] == pytest.approx([HZ] * 27, abs=1.5)

@@ -24,6 +24,8 @@ from body_tracking.systems import stage_class
 
 _LOOK_S = 0.1
 """Seconds between two checks of the published topics."""
+_AGAIN_NS = 100_000_000
+"""Nanoseconds from an error in what is due until the next attempt."""
 _SILENT_S = 3.0
 """Seconds without a message from which a node says that nothing of a driver arrives."""
 _SAVE_S = 2.0
@@ -145,14 +147,20 @@ class StageNode(GraphNode):
         self.sent_ns = None
 
     def poll(self) -> None:
-        """Publish the outputs that are due, and set the alarm for the next deadline."""
+        """Publish the outputs that are due, and set the alarm for the next deadline.
+
+        After an error it is a moment later: what cannot be used may wait on, and be due at once.
+        """
+        now_ns = self.waiting_ns()
+        earliest_ns = now_ns + _AGAIN_NS
         try:
-            self.publish(self.stage.poll(self.waiting_ns()))
+            self.publish(self.stage.poll(now_ns))
+            earliest_ns = 0
         except BodyTrackingError as error:
             self.malformed("a message that waited", str(error), "refused")
         finally:
-            deadline_ns = self.stage.deadline_ns
-            self.due.at(self.stage.due_ns if deadline_ns is None else deadline_ns)
+            due_ns = self.stage.due_ns if self.stage.deadline_ns is None else self.stage.deadline_ns
+            self.due.at(None if due_ns is None else max(due_ns, earliest_ns))
 
     def publish(self, outputs: Iterable[Output]) -> None:
         """Publish outputs of the stage, and log its events."""

@@ -87,7 +87,8 @@ class Monitor:
                 values[f"{name} max ms"] = f"{max(samples) / 1e6:.2f}"
                 samples.clear()
         values.update(self.totals)
-        values |= {f"raised {where}": count for where, count in self.failures.items()}
+        failures = dict(self.failures)  # a source's thread changes it
+        values |= {f"raised {where}": count for where, count in failures.items()}
         if self.last_reason:
             values["last malformed"] = self.last_reason
         return values

@@ -6,6 +6,7 @@ import contextlib
 import random
 import threading
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -32,13 +33,15 @@ from body_tracking.core.sensor_poses import level_pose  # noqa: E402
 from body_tracking.core.skeleton import NANOSECONDS, Skeleton  # noqa: E402
 from body_tracking.kinematics.conventions import angle_names  # noqa: E402
 from body_tracking.kinematics.upper_body import UpperBody  # noqa: E402
-from body_tracking.messages.base import RosMessages, to_nanoseconds  # noqa: E402
+from body_tracking.messages.base import MessageError, RosMessages, to_nanoseconds  # noqa: E402
 from body_tracking.messages.calibration import clock_to_time_reference, pose_to_transform  # noqa: E402
 from body_tracking.messages.skeletons import skeletons_to_cloud  # noqa: E402
 from body_tracking.pipeline import graph  # noqa: E402
+from body_tracking.pipeline.shared import RELIABLE as TRANSPORT  # noqa: E402
+from body_tracking.pipeline.stage import Output, Stage  # noqa: E402
 from body_tracking.recording.rosbag2 import BagReader  # noqa: E402
 from body_tracking.ros.executor import LeanExecutor  # noqa: E402
-from body_tracking.ros.host import node_of  # noqa: E402
+from body_tracking.ros.host import StageNode, node_of  # noqa: E402
 from body_tracking.ros.node import STEADY, GraphNode, RCLError  # noqa: E402
 from domains import domain  # noqa: E402
 from draws import draws  # noqa: E402
@@ -235,6 +238,44 @@ def test_callback_errors_are_counted_by_input_and_kind(tmp_path: Path) -> None:
         assert node.restarts == sum(count // 10 for count in node._failed_in_a_row.values())
         assert node._failed_in_a_row["/one"] == 12
         rclpy.try_shutdown()
+
+
+class Stuck(Stage):
+    """Raises whenever it is asked for what waits, but for the first time, and goes on waiting."""
+
+    NAME = "stuck"
+    PARAMETERS = (TRANSPORT,)
+    polls = 0
+
+    @property
+    def deadline_ns(self) -> int | None:
+        return 1
+
+    def poll(self, steady_ns: int) -> Iterable[Output]:
+        self.polls += 1
+        if self.polls == 1:
+            return ()
+        raise (ValueError if self.values["reliable"] else MessageError)("on purpose")
+
+
+class StuckNode(StageNode):
+    STAGE = Stuck
+
+
+@pytest.mark.parametrize("reliable", ["true", "false"])
+def test_what_waits_and_cannot_be_used_keeps_no_processor_busy(reliable: str) -> None:
+    rclpy.init(args=["--ros-args", "-p", f"reliable:={reliable}"], domain_id=domain())
+    node = StuckNode()
+    executor = LeanExecutor(node)
+    thread = threading.Thread(target=executor.spin, daemon=True)
+    thread.start()
+    began = time.monotonic()
+    time.sleep(1.0)
+    executor.stop()
+    thread.join(10.0)
+    assert 2 < node.stage.polls < 15 * (time.monotonic() - began)
+    node.destroy_node()
+    rclpy.try_shutdown()
 
 
 @pytest.mark.parametrize("executable", ["fusion", "skeleton_filter", "mesh_tracker"])
