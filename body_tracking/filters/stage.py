@@ -375,6 +375,13 @@ class FilterStage(Stage):
             for person in self._persons:
                 person.reset()
 
+    def restart(self) -> None:
+        super().restart()
+        if self._people is not None:  # sensors' frames, of which no jump of a stamp resets anything here
+            self._people.reset()
+            for person in self._persons:
+                person.forget()
+
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
         counters = self.counters
         self._report_t_poses(counters)

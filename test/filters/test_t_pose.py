@@ -225,6 +225,17 @@ def test_only_a_change_that_concerns_the_estimate_forgets_the_pose(name: str, so
     assert "the T-pose no longer counts" in stage.events.pop()
 
 
+@pytest.mark.parametrize(("name", "source"), INPUTS)
+def test_a_stage_that_restarts_after_errors_knows_nobody(name: str, source: str) -> None:
+    stage, fresh = hosted(name, source), hosted(name, source)
+    fed(stage, skeletons()[: HOLDING.stop])
+    stage.restart()
+    assert stage.counters["t_poses_forgotten"] == 1
+    following = skeletons()[HOLDING.stop : HOLDING.stop + 15]
+    for one, other in zip(fed(stage, following), fed(fresh, following), strict=True):
+        assert_array_equal(one.positions, other.positions)
+
+
 def test_lengths_are_those_between_the_joints_as_they_are_known_then() -> None:
     ekf, _, _ = taught("ekf")
     lengths = ekf.estimate.lengths  # type: ignore[attr-defined]
