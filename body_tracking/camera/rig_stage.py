@@ -12,7 +12,7 @@ from body_tracking.camera.pictures import RATE, Pictures
 from body_tracking.camera.pose_model import ImageArray, Landmarks
 from body_tracking.camera.settings import DRIVER, MODEL, PEOPLE, SEARCH, THREADS, WAIT_NS, image_port, trackers_of
 from body_tracking.camera.topics import COMPRESSED, DRIVERS, RIG_SENSOR
-from body_tracking.camera.triangulation import match, triangulate
+from body_tracking.camera.triangulation import SightLines, match, triangulate
 from body_tracking.core.parameters import Parameter, Value
 from body_tracking.core.skeleton import NANOSECONDS, Skeleton
 from body_tracking.core.sources import optical_frame
@@ -52,6 +52,7 @@ class RigStage(Stage):
         self._numbers = PersonNumbers(int(str(values["people"])))
         self._counters: Counter[str] = Counter()
         self._problems: dict[str, str] = {}
+        self._lines = SightLines()
         self._people = 0
         tolerance_ns = round(float(str(values["tolerance"])) * NANOSECONDS)
         self._sets: FrameSets[tuple[int, ImageArray]] = FrameSets(names, tolerance_ns, WAIT_NS)
@@ -103,6 +104,7 @@ class RigStage(Stage):
 
     def _skeletons(self, stamp_ns: int, found: Sequence[Mapping[int, Landmarks]]) -> tuple[Skeleton, ...]:
         self._counters["sets of images"] += 1
+        self._lines.add(self._rig, found)
         matched = match(self._rig, found)
         self._counters["people seen by one camera alone"] += sum(map(len, found)) - sum(map(len, matched))
         bodies = [triangulate(self._rig, views) for views in matched]
@@ -122,15 +124,15 @@ class RigStage(Stage):
     def reset(self, topic: str) -> None:
         """Forget the people and the images."""
         self._sets.reset()
+        self._lines = SightLines()
         self._numbers = PersonNumbers(self._numbers.most)
         for tracker in self._trackers.values():
             tracker.reset()
 
     def state(self, ros_ns: int) -> tuple[int, str, dict[str, object]]:
-        """Names the cameras whose images are missing, come at other times or have another size."""
+        """Names the cameras whose images are missing, come at other times or have another size, and a rig in doubt."""
         problems = [f"{name}: {text}" for name, text in self._problems.items()]
-        if self._sets.problem():
-            problems.append(self._sets.problem())
+        problems += [text for text in (self._sets.problem(), self._lines.problem()) if text]
         return (1 if problems else 0), "; ".join(problems), {"people": self._people}
 
     @property

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from test_lifting import PLACES
 
 from body_tracking.camera.codecs import CompressedColour
@@ -16,7 +17,7 @@ from body_tracking.camera.numbers import PersonNumbers
 from body_tracking.camera.pose_model import Landmark, Landmarks, Region
 from body_tracking.camera.rig_stage import RigStage
 from body_tracking.camera.topics import COMPRESSED, DRIVERS
-from body_tracking.camera.triangulation import ALIKE, View, match, triangulate
+from body_tracking.camera.triangulation import ALIKE, SightLines, View, match, triangulate
 from body_tracking.core.message_types import TRANSFORM
 from body_tracking.core.parameters import check_all
 from body_tracking.core.sensor_poses import SensorPose
@@ -132,6 +133,24 @@ def test_somebody_whom_one_camera_sees_alone_is_left_out() -> None:
     other = seen(rig, where, person(np.array([2.2, 0.6, -0.4])), 1.0, rng)
     assert match(rig, [{0: one[0]}, {}]) == []
     assert match(rig, [{0: one[0]}, {0: other[1]}]) == []
+
+
+@pytest.mark.parametrize(("degrees", "named"), [(0.0, False), (2.0, True), (-4.0, True)])
+def test_a_camera_that_was_turned_up_or_down_is_named(degrees: float, named: bool) -> None:
+    """The lines of sight pass each other; with 4 degrees by so much that nobody is matched any more."""
+    where = poses(-0.5, 0.6)
+    turned = Rotation.from_euler("x", degrees, degrees=True)  # about the optical x axis
+    there = SensorPose("camera2", where[1].translation, (Rotation.from_quat(where[1].quat_xyzw) * turned).as_quat())
+    rig, actual, rng = rig_of(where, CAMERA), rig_of([where[0], there], CAMERA), np.random.default_rng(5)
+    lines = SightLines()
+    for _ in range(40):
+        assert lines.problem() == "" or named
+        points = person(np.array([2.2, 0.1, 0.0]) + rng.uniform(-0.2, 0.2, 3) * [1.0, 1.0, 0.0])
+        one, other = seen(actual, [where[0], there], points, 1.0, rng)
+        lines.add(rig, [{0: one}, {0: other}])
+        lines.add(rig, [{0: one}, {}])
+        lines.add(rig, [{0: one}, {0: other, 1: one}])  # who is whom is not known
+    assert ("was a camera moved" in lines.problem()) == named
 
 
 def test_numbers_stay_with_people_who_swap_their_order_or_are_gone_for_a_moment() -> None:
