@@ -15,6 +15,7 @@ from body_tracking.core.measurement import (
     joint_correlation,
     joint_stddev,
     joint_variance,
+    left_right_axes,
     viewing_angle,
 )
 from body_tracking.core.skeleton import BONES, MIRROR, N_JOINTS, Joint
@@ -37,6 +38,12 @@ def test_viewing_angle_is_the_yaw_to_the_sensor(degrees: float) -> None:
 def test_swapped_sides_look_like_a_back() -> None:
     assert viewing_angle(AT_TWO_METRES[MIRROR]) == pytest.approx(np.pi, abs=0.02)
     assert_allclose(body_heading(AT_TWO_METRES[MIRROR]), -body_heading(AT_TWO_METRES))
+    axes = left_right_axes(AT_TWO_METRES)
+    for hidden, seen in (("HIP", axes[0]), ("SHOULDER", axes[1])):
+        partly = AT_TWO_METRES.copy()
+        partly[[Joint[f"{hidden}_LEFT"], Joint[f"{hidden}_RIGHT"]]] = np.nan
+        both = np.stack([partly, AT_TWO_METRES])
+        assert_allclose(body_heading(both), [seen, body_heading(AT_TWO_METRES)])
 
 
 def test_noise_is_larger_from_the_side_from_afar_and_when_inferred() -> None:

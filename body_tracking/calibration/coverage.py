@@ -14,6 +14,9 @@ PLACE_SIZE = 0.3
 HEADINGS = 8
 """Sectors of the body's heading."""
 
+_TRUNK: IntArray = np.array([Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER], dtype=np.intp)
+"""The first of them that is known is at the place of a body."""
+
 
 class Coverage:
     """Pairs of frames by place and heading of the body, the newest ``per_place`` of each.
@@ -58,7 +61,8 @@ class Coverage:
 
     def _place(self, reference: FloatArray) -> IntArray:
         """(3,) indices of place across the view, place along it, and sector of the heading; optical frame, y down."""
-        centre, axis = reference[Joint.SPINE_BASE], body_heading(reference)
+        trunk = reference[_TRUNK]
+        centre, axis = trunk[int(np.isfinite(trunk[:, 0]).argmax())], body_heading(reference)
         sector = np.arctan2(axis[2], axis[0]) / (2 * np.pi) * HEADINGS
         key = np.array([centre[0] / PLACE_SIZE, centre[2] / PLACE_SIZE, sector])
         place: IntArray = np.floor(np.nan_to_num(key)).astype(np.intp)

@@ -137,10 +137,15 @@ def body_heading(positions: FloatArray) -> FloatArray:
         positions: (..., 25, 3) metres, any frame.
 
     Returns:
-        (..., 3) metres: the mean of the vectors from right to left shoulder and from right to left hip.
+        (..., 3) metres: the mean of the vectors from right to left shoulder and from right to left hip; the one that is
+        known where the other is not, as of a person behind a table.
     """
     axes = left_right_axes(positions)
-    axis: FloatArray = 0.5 * (axes[..., 0, :] + axes[..., 1, :])  # numpy's mean takes more than twice as long
+    upper, lower = axes[..., 0, :], axes[..., 1, :]
+    axis: FloatArray = 0.5 * (upper + lower)  # numpy's mean takes more than twice as long
+    unknown = np.isnan(axis)
+    if unknown.any():
+        axis = np.where(unknown, np.where(np.isnan(lower), upper, lower), axis)
     return axis
 
 

@@ -82,15 +82,20 @@ class _Heading:
         return math.remainder(angle - self.angle, math.pi)
 
     def update(self, angles: Sequence[float], weights: Sequence[float]) -> float:
-        """Update with the sensors' angles, radians, downweighting large innovations.
+        """Update with the sensors' angles, radians, downweighting large innovations; start with the surest of them.
 
         Args:
             angles: radians.
             weights: inverse variances, 1/rad2; 0 where nothing was measured.
 
         Returns:
-            Size of the correction, radians.
+            Size of the correction, radians; infinite at the start.
         """
+        if math.isnan(self.angle):
+            surest = max(range(len(weights)), key=lambda index: weights[index])
+            if weights[surest]:
+                self.angle, self._variance = angles[surest], _START_VARIANCE
+            return math.inf
         total = towards = 0.0
         for angle, weight in zip(angles, weights, strict=True):
             if not weight:
@@ -230,7 +235,7 @@ class Sides:
             weights: of each, by :func:`heading_weights`.
             counters: counts ``reversals_accepted``.
         """
-        known = [index for index, found in enumerate(headings) if not math.isnan(found[0] + found[1])]
+        known = [index for index, found in enumerate(headings) if not all(map(math.isnan, found))]
         if not known:
             return [half.angle for half in self._halves]
         leading = next((index for index in known if names[index] == self.trusted), None)
@@ -278,22 +283,17 @@ class Sides:
         self._known_since, self._reversed_since = self._known_from(stamp, angle), None
 
     def _sense(self, headings: Sequence[float], weights: Sequence[float]) -> float:
-        """1 where a sensor's headings equal the estimate, -1 where reversed; the weighted mean of both halves."""
-        total = sum(weights)
-        agreement = (
-            weight * math.cos(heading - half.angle)
-            for heading, half, weight in zip(headings, self._halves, weights, strict=True)
-        )
-        return sum(agreement) / total if total else 0.0
+        """1 where a sensor's headings equal the estimate, -1 where reversed; the weighted mean of the known halves."""
+        return _agreement(headings, [half.angle for half in self._halves], weights) or 0.0
 
     def _expected(self, stamp: int, name: str, headings: Sequence[float], weights: Sequence[float]) -> float:
         """The sense in which a sensor should see the body: as in its last frame, unless it swapped left and right."""
         view = self._views.get(name)
-        total = sum(weights)
-        if view is None or stamp - view.stamp > VIEW_KEPT or not total:
+        fresh = view is not None and stamp - view.stamp <= VIEW_KEPT
+        kept = _agreement(headings, view.headings, weights) if view is not None and fresh else None
+        if view is None or kept is None:
             sense = math.copysign(1.0, self._sense(headings, weights))
         else:
-            kept = sum(w * math.cos(a - b) for a, b, w in zip(headings, view.headings, weights, strict=True)) / total
             sense = view.sense if kept > 0.0 else -view.sense
         self._views[name] = _View(stamp, headings, sense)
         return sense
@@ -308,7 +308,7 @@ class Sides:
     ) -> int:
         """The trusted sensor, or one that has agreed with it and seen the body more from the front for a while."""
         upper = headings[leading][0]
-        agreeing = [index for index in known if math.cos(headings[index][0] - upper) > _CLOSE]
+        agreeing = [index for index in known if math.cos(headings[index][0] - upper) > _CLOSE] or [leading]
         better = min(agreeing, key=lambda index: angles[index])
         if angles[leading] - angles[better] <= MORE_FRONTAL:
             self._better_since = None
@@ -371,6 +371,17 @@ class Sides:
                 fused = _turned(fused, half, -excess)
                 counters["turned_gently"] += 1
         return fused
+
+
+def _agreement(headings: Sequence[float], others: Sequence[float], weights: Sequence[float]) -> float | None:
+    """Weighted mean cosine between the headings of both halves, or of the one that is known; None without one."""
+    known = [
+        (weight, math.cos(heading - other))
+        for heading, other, weight in zip(headings, others, weights, strict=True)
+        if weight and not math.isnan(other)
+    ]
+    total = sum(weight for weight, _ in known)
+    return sum(weight * cosine for weight, cosine in known) / total if total else None
 
 
 def _turned(skeleton: Skeleton, half: int, angle: float) -> Skeleton:

@@ -296,6 +296,19 @@ def test_a_still_pose_starts_and_movement_refines() -> None:
     assert values["kinect2 clock_from"] == "motion"
 
 
+def test_a_person_behind_a_table_calibrates_as_well() -> None:
+    """Hips and legs are out of view; the person must not count as always in one place, nor as turned."""
+    lower = [joint for joint in Joint if joint.name.startswith(("HIP", "KNEE", "ANKLE", "FOOT", "SPINE_BASE"))]
+    hidden = []
+    for sensor, seen, received in stream(20.0):
+        positions, states = seen.positions.copy(), seen.states.copy()
+        positions[lower], states[lower] = np.nan, TrackingState.NOT_TRACKED
+        hidden.append((sensor, replace(seen, positions=positions, states=states), received))
+    calibration, _ = run(hidden)
+    assert yaw_error(calibration.finish()) < 0.5
+    assert calibration.status()[:2] == (0, "calibrated")
+
+
 @pytest.mark.parametrize("turned", ["kinect1", "kinect2"])
 @pytest.mark.parametrize("seconds", some([5.0, 60.0]))
 def test_a_sensor_that_sees_the_body_turned_around_does_not_turn_the_pose(turned: str, seconds: float) -> None:

@@ -318,6 +318,33 @@ def test_a_temporary_reversal_in_one_sensor_is_swapped_back(sensor: str, seconds
     assert errors(fused)[30:].max() < 0.05
 
 
+LOWER = [each for each in Joint if each.name.startswith(("HIP", "KNEE", "ANKLE", "FOOT")) or each is Joint.SPINE_BASE]
+UPPER = [each for each in Joint if each not in LOWER]
+
+
+def behind_a_table(seen: Skeleton) -> Skeleton:
+    """Nothing below the waist is seen."""
+    positions, states = seen.positions.copy(), seen.states.copy()
+    positions[LOWER], states[LOWER] = np.nan, TrackingState.NOT_TRACKED
+    return replace(seen, positions=positions, states=states)
+
+
+@pytest.mark.parametrize("sensor", ["kinect1", "kinect2"])
+def test_sides_of_a_person_behind_a_table_are_repaired_by_the_shoulders_alone(sensor: str) -> None:
+    """Also where the hips come into view later, in a frame that shows them swapped."""
+
+    def change(skeleton: Skeleton, name: str) -> Skeleton:
+        stamp = skeleton.stamp - (OFFSET if name == "kinect2" else 0.0)
+        turned = skeleton.mirrored() if name == sensor and 4.0 <= stamp < 5.2 else skeleton
+        return turned if stamp > 5.0 else behind_a_table(turned)
+
+    given_frames = changed(frames(8.0), "kinect1", lambda seen: change(seen, "kinect1"))
+    fused = run(made := fusion(), changed(given_frames, "kinect2", lambda seen: change(seen, "kinect2")))
+    assert made.counters["repaired"] > 0 and not made.counters["reversals_accepted"]
+    assert errors(fused)[30:, UPPER].max() < 0.05
+    assert errors(fused)[180:].max() < 0.05
+
+
 @pytest.mark.parametrize("sensor", ["kinect1", "kinect2"])
 def test_an_impossible_turn_in_one_sensor_is_rejected(sensor: str) -> None:
     """In a side view, swapped sides can turn the body by less than half a turn."""
