@@ -75,7 +75,8 @@ class InverseKinematics:
     def start(self, positions: FloatArray) -> FloatArray:
         """A configuration in closed form, from the directions between the points; no lengths are needed.
 
-        Coordinates that missing points leave undetermined are neutral.
+        Coordinates that missing points leave undetermined are neutral; a trunk of which only the shoulders are seen is
+        upright.
 
         Args:
             positions: (19, 3) metres, in world; NaN where a point is not measured.
@@ -84,16 +85,21 @@ class InverseKinematics:
             (35,) configuration.
 
         Raises:
-            ModelError: SpineBase, SpineMid and SpineShoulder determine no trunk.
+            ModelError: neither SpineBase, SpineMid and SpineShoulder nor the shoulders determine a trunk.
         """
         point = {joint: positions[number] for joint, number in self._point.items()}
         base, mid, top = (point[joint] for joint in (_J.SPINE_BASE, _J.SPINE_MID, _J.SPINE_SHOULDER))
         hips = point[_J.HIP_LEFT] - point[_J.HIP_RIGHT]
         shoulders = point[_J.SHOULDER_LEFT] - point[_J.SHOULDER_RIGHT]
+        top = _first(top, 0.5 * (point[_J.SHOULDER_LEFT] + point[_J.SHOULDER_RIGHT]))
         lower, upper = mid - base, top - mid
         lower, upper = _first(lower, top - base, upper), _first(upper, top - base, lower)
+        if not np.isfinite(lower).all() and np.isfinite(shoulders).all():
+            lower = upper = np.array([0.0, 0.0, 1.0])  # behind a table: upright until more is seen
         if not np.isfinite(lower).all():
-            raise ModelError("inverse kinematics: no two of SpineBase, SpineMid, SpineShoulder are seen")
+            raise ModelError(
+                "inverse kinematics: neither two of SpineBase, SpineMid and SpineShoulder nor both shoulders are seen"
+            )
         hips, shoulders = _first(hips, shoulders, _perpendicular(lower)), _first(shoulders, hips, _perpendicular(upper))
 
         q = self.model.neutral()

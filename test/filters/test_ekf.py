@@ -890,9 +890,21 @@ def test_damaged_numbers_do_no_harm(field: str, values: tuple[float, ...]) -> No
     assert rms(errors_of(outputs, truth)) < np.sqrt(3.0) * NOISE
 
 
+def test_a_person_behind_a_table_is_tracked_by_shoulders_and_arms() -> None:
+    """Hips and spine are out of the image: the trunk is upright until it is seen, what is seen is right at once."""
+    truth = random_truth(71, 2.5, tempo=0.5)
+    hidden = tuple(joint for joint in Joint if joint.name.startswith(("SPINE", "NECK", "HIP", "KNEE", "ANKLE", "FOOT")))
+    outputs = run(ExtendedKalmanFilter(), measured(truth, dropouts=(Dropout(0.0, 1.5, hidden),)).skeletons)
+    assert all(output is not None for output in outputs[START_FRAMES - 1 :])
+    arms = [k for k, joint in enumerate(POINTS) if Joint(joint).name.startswith(("SHOULDER", "ELBOW", "WRIST"))]
+    until = int(np.sum(truth.times < 1.5))
+    assert rms(errors_of(outputs[:until], truth, SETTLED)[:, arms]) < np.sqrt(3.0) * NOISE
+    assert rms(errors_of(outputs, truth, 2.0)) < np.sqrt(3.0) * NOISE
+
+
 def test_without_a_trunk_there_is_no_start() -> None:
     truth = random_truth(71, 1.5)
-    trunk = (Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER)
+    trunk = (Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER, Joint.SHOULDER_LEFT)
     estimator = ExtendedKalmanFilter()
     outputs = run(estimator, measured(truth, dropouts=(Dropout(0.0, 0.7, trunk),)).skeletons)
     early = [output for k, output in enumerate(outputs) if truth.times[k] < 0.7]
