@@ -52,6 +52,14 @@ class SkeletonFilter(Protocol):
 
 
 @runtime_checkable
+class LearningFilter(SkeletonFilter, Protocol):
+    """A filter that learns a person's joint centres from a T-pose."""
+
+    def forget_joint_centres(self) -> None:
+        """Forget what a T-pose has shown, because the next frames may be of another person; all else stays."""
+
+
+@runtime_checkable
 class ModelFilter(SkeletonFilter, Protocol):
     """A filter on a body model, which takes each sensor's frames separately and predicts."""
 

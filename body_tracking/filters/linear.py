@@ -128,6 +128,10 @@ class LinearKalmanFilter(JointSmoother):
         self._centres.reset()
         self._restart()
 
+    def forget_joint_centres(self) -> None:
+        """Forget what a T-pose has shown of the person."""
+        self._centres.reset()
+
     def _restart(self) -> None:
         """Forget every joint."""
         size = 3 * self._order

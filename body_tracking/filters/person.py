@@ -11,7 +11,7 @@ from body_tracking.core.estimate import ModelEstimate
 from body_tracking.core.orientation import SegmentOrientation
 from body_tracking.core.qos import Qos
 from body_tracking.core.skeleton import NANOSECONDS, Skeleton
-from body_tracking.filters import THESIS_FILTERS, ModelFilter, SkeletonFilter
+from body_tracking.filters import THESIS_FILTERS, LearningFilter, ModelFilter, SkeletonFilter
 from body_tracking.filters.prediction import Prediction
 from body_tracking.filters.smoothing import FixedLag, SmoothableFilter
 from body_tracking.fusion.alignment import SensorAlignment
@@ -254,19 +254,17 @@ class PersonFilter:
     def _see(self, stamp_ns: int) -> None:
         """Note that the person was seen, by a camera or a worn sensor; after a longer absence it may be another one."""
         last_ns = self._seen_ns
-        if last_ns is not None and stamp_ns - last_ns > _AWAY_NS:
-            self._forget_person()
+        if last_ns is not None and stamp_ns - last_ns > _AWAY_NS and isinstance(self._filter, LearningFilter):
+            self.flush()
+            self._filter.forget_joint_centres()
         if last_ns is None or stamp_ns > last_ns or jumped_back(stamp_ns, last_ns):
             self._seen_ns = stamp_ns
 
-    def _forget_person(self) -> None:
+    def reset(self) -> None:
+        """Publish the held frames, and forget the person, after a jump of time; poses and clocks stay."""
         self.flush()
         self._filter.reset()
         self._lengths.reset()
-
-    def reset(self) -> None:
-        """Publish the held frames, and forget the person, after a jump of time; poses and clocks stay."""
-        self._forget_person()
         self._ordering.flush()
         self._prediction.stop()
         self._published_ns = self._seen_ns = None

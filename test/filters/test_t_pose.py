@@ -171,6 +171,7 @@ def others(away: float) -> list[Skeleton]:
 
 @pytest.mark.parametrize(("name", "source"), INPUTS)
 def test_another_person_is_filtered_as_if_nobody_had_been_there(name: str, source: str) -> None:
+    """But for the lengths, which the extended filter keeps, as mostly the same person comes back."""
     stage, alone = hosted(name, source), hosted(name, source)
     fed(stage, skeletons()[: HOLDING.stop])
     stage.state(0)
@@ -179,10 +180,13 @@ def test_another_person_is_filtered_as_if_nobody_had_been_there(name: str, sourc
     found, expected = (
         [seen for seen in fed(each, others(HOLD + 0.1)) if seen.stamp_ns >= start_ns] for each in (stage, alone)
     )
-    assert len(found) == len(expected) > 10
-    for one, other in zip(found, expected, strict=True):
-        assert_array_equal(one.positions, other.positions)
-        assert_array_equal(one.covariances, other.covariances)
+    assert len(found) >= len(expected) > 10
+    for one, other in zip(found[len(found) - len(expected) :], expected, strict=True):
+        if name == "ekf":
+            assert np.nanmax(np.abs(one.positions - other.positions)) < 0.02
+        else:
+            assert_array_equal(one.positions, other.positions)
+            assert_array_equal(one.covariances, other.covariances)
     stage.state(0)
     assert "the T-pose no longer counts" in stage.events.pop()
 

@@ -132,6 +132,11 @@ class ExtendedKalmanFilter:
         self._lengths_from_ns: int | None = None
         self._output.forget()
 
+    def forget_joint_centres(self) -> None:
+        """Forget what a T-pose has shown of the person. Lengths stay: frames of another person's replace them soon."""
+        self._centres.reset()
+        self._lengths_from_ns = None
+
     @property
     def innovation_distance(self) -> float:
         """The last frame's normalised innovation squared over all its accepted points; NaN before the first one."""
