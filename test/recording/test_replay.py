@@ -280,7 +280,7 @@ def test_measurements_that_come_too_late_are_named(tmp_path: Path) -> None:
     """Frames of one sensor on a network that becomes slow."""
     with BagReader(BAG) as bag:
         known = {topic: bag.topics[topic].type_name for topic in bag.topics if topic.startswith("/kinect")}
-        slow_ns, end_ns = bag.start_ns + 5 * NANOSECONDS, bag.start_ns + 7 * NANOSECONDS
+        slow_ns, end_ns = bag.start_ns + 4 * NANOSECONDS, bag.start_ns + 6 * NANOSECONDS
         messages = [raw for raw in bag.messages(list(known)) if raw.log_time_ns < end_ns]
     late = {
         id(raw): raw.log_time_ns
@@ -306,10 +306,12 @@ def test_a_sensor_that_repeats_one_frame_is_named(filter_name: str, tmp_path: Pa
         known = {each: bag.topics[each].type_name for each in bag.topics if each.startswith("/kinect")}
         for each, kind in known.items():
             writer.add_topic(each, kind)
-        from_ns, to_ns = bag.start_ns + 4 * NANOSECONDS, bag.start_ns + 6 * NANOSECONDS
+        from_ns, to_ns, end_ns = (bag.start_ns + count * NANOSECONDS for count in (3, 4, 5))
         codec, left_out = Skeletons(), 0
         last: tuple[Skeleton, ...] = ()
         for raw in bag.messages(list(known)):
+            if raw.log_time_ns > end_ns:
+                break
             cdr = raw.cdr
             if raw.topic == topic:
                 (seen,) = codec.decode(cdr, BAG_WIRE)
