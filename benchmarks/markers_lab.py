@@ -177,22 +177,23 @@ class Lab:
         return conventional(moved)[0]
 
 
-def arm(rng: np.random.Generator, names: Sequence[str]) -> Tree:
-    """A ball joint between the first two targets and a hinge between the last two, about 0.12 m from all of them."""
+def random_joint(rng: np.random.Generator, kind: JointKind, name: str, parent: str, child: str) -> Joint:
+    """A joint about 120 mm from both targets, by the conventions."""
 
     def centre() -> FloatArray:
         direction = rng.normal(size=3)
         return rng.uniform(0.09, 0.15) * direction / np.linalg.norm(direction)
 
-    joints = []
-    for kind, parent, child in ((JointKind.BALL, *names[:2]), (JointKind.HINGE, *names[1:])):
-        frames = [np.eye(3)] * 2
-        if kind is JointKind.HINGE:
-            frames = [Rotation.random(random_state=rng).as_matrix() for _ in range(2)]
-        name = "shoulder" if kind is JointKind.BALL else "elbow"
-        joint = Joint(name, parent, child, kind, frames[0], centre(), frames[1], centre(), np.zeros((SIZE, SIZE)))
-        joints.append(conventional(joint)[0])
-    return tree_of(joints)
+    ball = kind is JointKind.BALL
+    frames = [np.eye(3) if ball else Rotation.random(random_state=rng).as_matrix() for _ in range(2)]
+    joint = Joint(name, parent, child, kind, frames[0], centre(), frames[1], centre(), np.zeros((SIZE, SIZE)))
+    return conventional(joint)[0]
+
+
+def arm(rng: np.random.Generator, names: Sequence[str]) -> Tree:
+    """A ball joint between the first two targets and a hinge between the last two."""
+    kinds = (JointKind.BALL, "shoulder", *names[:2]), (JointKind.HINGE, "elbow", *names[1:])
+    return tree_of([random_joint(rng, *each) for each in kinds])
 
 
 def motion(rng: np.random.Generator, tree: Tree, frames: int, degrees: float) -> Posture:

@@ -36,7 +36,6 @@ from body_tracking.mesh.solver import Orientation
 from body_tracking.mesh.topics import depth_topic, mesh_sensor
 from body_tracking.pipeline import graph
 from body_tracking.simulation.depth_scene import RATE, SENSOR, DepthScene
-from body_tracking.simulation.people import MODEL
 
 MOTIONS = ("reaching", "two_handed_wave", "torso_twist")
 SEGMENTS = tuple(f"forearm_{side}" for side in SIDES)
@@ -108,14 +107,8 @@ def worn(scene: DepthScene, seconds: float) -> list[SegmentOrientation]:
     p, found = EkfParameters(), []
     left_over = p.misalignment_stddev**2 * np.eye(3) + np.diag([0.0, 0.0, p.heading_stddev**2])
     for number, segment in enumerate(SEGMENTS):
-        place = MODEL.segment_names.index(segment)
-
-        def motion(times: FloatArray, place: int = place) -> tuple[FloatArray, FloatArray]:
-            posture = MODEL.forward(scene.course(times).q, scene.who.person.lengths)
-            return posture.rotations[:, place], posture.origins[:, place]
-
         imu = SimulatedImu(f"imu_{segment}", segment, usual_mounting(segment, scene.who.person.stature), oriented=True)
-        samples = imu.samples(motion, seconds, 0, np.random.default_rng([scene.seed, 4, number]))
+        samples = imu.samples(scene.motion_of(segment), seconds, 0, np.random.default_rng([scene.seed, 4, number]))
         own = aligned(imu, samples, p, np.random.default_rng([scene.seed, 9, number]))
         found += [replace(each, covariance=each.covariance + left_over) for each in own]
     return sorted(found, key=lambda each: each.stamp_ns)

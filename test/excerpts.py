@@ -1,11 +1,17 @@
-"""Parts of recordings, for laws that do not need all of one."""
+"""Recordings as a whole, and parts of them for laws that do not need all of one."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from body_tracking.core.skeleton import NANOSECONDS
-from body_tracking.recording.rosbag2 import BagReader, BagWriter
+from body_tracking.recording.rosbag2 import BagReader, BagWriter, RawMessage
+
+
+def contents(bag: Path) -> list[RawMessage]:
+    """All messages of a bag."""
+    with BagReader(bag) as reader:
+        return list(reader.messages())
 
 
 def beginning(bag: Path, excerpt: Path, seconds: float) -> Path:

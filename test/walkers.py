@@ -73,6 +73,16 @@ def frame(stamp: float, positions: FloatArray, sensor: str = "kinect1", states: 
     return Skeleton(round(stamp * NANOSECONDS), f"{sensor}_optical_frame", positions, states.copy())
 
 
+def tracked(positions: FloatArray) -> Skeleton:
+    """Joints (25, 3), all tracked, in ``world``."""
+    return Skeleton(1, "world", positions, TRACKED.copy())
+
+
+def degrees_between(rotation: FloatArray, other: FloatArray) -> float:
+    """Angle between two rotation matrices."""
+    return float(np.degrees(Rotation.from_matrix(rotation @ other.T).magnitude()))
+
+
 def about_y(degrees: float) -> FloatArray:
     """Rotation about the optical y axis, which is vertical."""
     matrix: FloatArray = Rotation.from_euler("y", degrees, degrees=True).as_matrix()

@@ -118,7 +118,8 @@ def urdf(model: UpperBody, lengths: FloatArray, body: str) -> str:
     return '<?xml version="1.0"?>\n' + ElementTree.tostring(robot, encoding="unicode") + "\n"
 
 
-def _numbers(values: FloatArray) -> str:
+def numbers(values: FloatArray) -> str:
+    """Numbers as the text of an attribute."""
     # adding zero makes -0 a 0
     return " ".join(repr(float(value) + 0.0) for value in values)
 
@@ -133,7 +134,7 @@ def _connect(
     joint = ElementTree.SubElement(robot, "joint", name=name, type=kind)
     ElementTree.SubElement(joint, "parent", link=parent)
     ElementTree.SubElement(joint, "child", link=child)
-    ElementTree.SubElement(joint, "origin", xyz=_numbers(place), rpy="0 0 0")
+    ElementTree.SubElement(joint, "origin", xyz=numbers(place), rpy="0 0 0")
     return joint
 
 
@@ -151,7 +152,7 @@ def _revolute(
     limits: FloatArray,
 ) -> None:
     joint = _connect(robot, name, "revolute", parent, child, place)
-    ElementTree.SubElement(joint, "axis", xyz=_numbers(axis))
+    ElementTree.SubElement(joint, "axis", xyz=numbers(axis))
     ElementTree.SubElement(
         joint,
         "limit",
@@ -170,7 +171,7 @@ def _draw(
     if segment == "head":
         centre, rotation, inertia = end, np.zeros(3), np.full(3, 0.4 * mass * radius**2)
         visual = ElementTree.SubElement(link, "visual")
-        ElementTree.SubElement(visual, "origin", xyz=_numbers(centre), rpy="0 0 0")
+        ElementTree.SubElement(visual, "origin", xyz=numbers(centre), rpy="0 0 0")
         ElementTree.SubElement(ElementTree.SubElement(visual, "geometry"), "sphere", radius=repr(radius))
         ElementTree.SubElement(visual, "material", name=colour)
     else:
@@ -179,7 +180,7 @@ def _draw(
         across = mass * (3.0 * radius**2 + length**2) / 12.0
         inertia = np.array([across, across, 0.5 * mass * radius**2])
     inertial = ElementTree.SubElement(link, "inertial")
-    ElementTree.SubElement(inertial, "origin", xyz=_numbers(centre), rpy=_numbers(rotation))
+    ElementTree.SubElement(inertial, "origin", xyz=numbers(centre), rpy=numbers(rotation))
     ElementTree.SubElement(inertial, "mass", value=repr(mass))
     ixx, iyy, izz = (repr(float(moment)) for moment in inertia)
     ElementTree.SubElement(inertial, "inertia", ixx=ixx, iyy=iyy, izz=izz, ixy="0", ixz="0", iyz="0")
@@ -195,7 +196,7 @@ def _cylinder(
     centre = 0.5 * (start + end)
     rotation = np.array([np.arcsin(-y), np.arctan2(x, z), 0.0])
     visual = ElementTree.SubElement(link, "visual")
-    ElementTree.SubElement(visual, "origin", xyz=_numbers(centre), rpy=_numbers(rotation))
+    ElementTree.SubElement(visual, "origin", xyz=numbers(centre), rpy=numbers(rotation))
     ElementTree.SubElement(
         ElementTree.SubElement(visual, "geometry"), "cylinder", radius=repr(radius), length=repr(length)
     )

@@ -180,8 +180,22 @@ class Corners:
         return Corners(self.cameras[chosen], self.views[chosen], self.board[chosen], self.pixels[chosen])
 
 
+class FitToPixels:
+    """Base of fits with ``residuals`` (m, 2) in pixels."""
+
+    __slots__ = ()
+    residuals: FloatArray
+
+    def rms(self, chosen: BoolArray | None = None) -> float:
+        """Root mean square of the 2D residual's norm, pixels, as OpenCV defines it: sqrt(2) times the RMS of one
+        axis.
+        """
+        residuals = self.residuals if chosen is None else self.residuals[chosen]
+        return float(np.sqrt((residuals**2).sum(axis=-1).mean()))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class Adjusted:
+class Adjusted(FitToPixels):
     """A rig fitted to corners of boards.
 
     Attributes:
@@ -197,13 +211,6 @@ class Adjusted:
     translations: FloatArray
     residuals: FloatArray
     noise: float
-
-    def rms(self, chosen: BoolArray | None = None) -> float:
-        """Root mean square of the 2D residual's norm, pixels, as OpenCV defines it: sqrt(2) times the RMS of one
-        axis.
-        """
-        residuals = self.residuals if chosen is None else self.residuals[chosen]
-        return float(np.sqrt((residuals**2).sum(axis=-1).mean()))
 
 
 _Boards = tuple[Rig, FloatArray, FloatArray]

@@ -13,7 +13,7 @@ import numpy as np
 
 from body_tracking.core.skeleton import BoolArray, FloatArray, IntArray
 from body_tracking.markers import projection
-from body_tracking.markers.bundle import BundleError, Linearised, minimise
+from body_tracking.markers.bundle import BundleError, FitToPixels, Linearised, minimise
 from body_tracking.markers.rig import Rig
 
 
@@ -54,7 +54,7 @@ class Lengths:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class AdjustedPoints:
+class AdjustedPoints(FitToPixels):
     """A rig fitted to points.
 
     Attributes:
@@ -70,11 +70,6 @@ class AdjustedPoints:
     residuals: FloatArray
     length_errors: FloatArray
     noise: float
-
-    def rms(self, chosen: BoolArray | None = None) -> float:
-        """Root mean square of the 2D residual's norm, pixels."""
-        residuals = self.residuals if chosen is None else self.residuals[chosen]
-        return float(np.sqrt((residuals**2).sum(axis=-1).mean()))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,7 +12,7 @@ import numpy as np
 from body_tracking.core import files, so3
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.core.skeleton import MAX_RANGE, FloatArray
-from body_tracking.kinematics.urdf import GREATEST_RATE, GREATEST_TORQUE
+from body_tracking.kinematics.urdf import GREATEST_RATE, GREATEST_TORQUE, numbers
 from body_tracking.markers.chain import Chain
 from body_tracking.markers.joint_model import SIZE, Joint, JointKind
 
@@ -150,7 +150,7 @@ def to_urdf(chain: Chain, body: str) -> str:
         axes = np.eye(3) if joint.kind is JointKind.BALL else np.tile([0.0, 0.0, 1.0], (joint.kind.coordinates, 1))
         for angle, axis in zip(joint.angle_names, axes, strict=True):
             element = _connect(robot, f"{angle}_{body}", "revolute", link, f"{angle}_link", centre, rotation)
-            ElementTree.SubElement(element, "axis", xyz=_text(axis))
+            ElementTree.SubElement(element, "axis", xyz=numbers(axis))
             limits = {"lower": -2.0 * np.pi, "upper": 2.0 * np.pi, "effort": GREATEST_TORQUE, "velocity": GREATEST_RATE}
             ElementTree.SubElement(element, "limit", {key: repr(float(value)) for key, value in limits.items()})
             link = f"{angle}_link"
@@ -176,7 +176,7 @@ def _connect(
     joint = ElementTree.SubElement(robot, "joint", name=name, type=kind)
     ElementTree.SubElement(joint, "parent", link=parent)
     ElementTree.SubElement(joint, "child", link=child)
-    ElementTree.SubElement(joint, "origin", xyz=_text(place), rpy=_text(_roll_pitch_yaw(rotation)))
+    ElementTree.SubElement(joint, "origin", xyz=numbers(place), rpy=numbers(_roll_pitch_yaw(rotation)))
     return joint
 
 
@@ -187,8 +187,3 @@ def _roll_pitch_yaw(rotation: FloatArray) -> FloatArray:
     if level < 1e-9:
         return np.array([np.arctan2(-rotation[1, 2], rotation[1, 1]), pitch, 0.0])
     return np.array([np.arctan2(rotation[2, 1], rotation[2, 2]), pitch, np.arctan2(rotation[1, 0], rotation[0, 0])])
-
-
-def _text(values: FloatArray) -> str:
-    # adding zero makes -0 a 0
-    return " ".join(repr(float(value) + 0.0) for value in values)

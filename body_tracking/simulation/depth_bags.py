@@ -139,15 +139,14 @@ def inertial_messages(
 ) -> Iterator[Message]:
     """The readings of worn sensors with their own orientation filters, unordered."""
     for number, segment in enumerate(segments):
-        place = MODEL.segment_names.index(segment)
-
-        def motion(times: FloatArray, place: int = place) -> tuple[FloatArray, FloatArray]:
-            posture = MODEL.forward(scene.course(times).q, scene.who.person.lengths)
-            return posture.rotations[:, place], posture.origins[:, place]
-
         imu = SimulatedImu(segment, segment, usual_mounting(segment, scene.who.person.stature), rate, oriented=True)
         rng = np.random.default_rng([scene.seed, 4, number])
         samples = imu.samples(
-            motion, seconds, START_NS, rng, surroundings=Surroundings(), received_from_ns=RECEIVED_FROM_NS
+            scene.motion_of(segment),
+            seconds,
+            START_NS,
+            rng,
+            surroundings=Surroundings(),
+            received_from_ns=RECEIVED_FROM_NS,
         )
         yield from imu_messages(imu, replace(samples, magnetic_field=None))

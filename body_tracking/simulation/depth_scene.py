@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
@@ -20,7 +20,7 @@ from body_tracking.mesh.raster import render
 from body_tracking.mesh.simulated import DepthErrors, measured
 from body_tracking.simulation.clothed import ClothedPerson
 from body_tracking.simulation.makehuman import MakeHuman
-from body_tracking.simulation.people import Course
+from body_tracking.simulation.people import MODEL, Course
 from body_tracking.simulation.repertoire import Movement, make_movement
 
 RATE: Final = 30.0
@@ -105,6 +105,16 @@ class DepthScene:
         movement = self.movement
         inside = np.clip(times * self.speed, 0.0, movement.duration)
         return movement.course(inside).placed(np.array([_DISTANCE, 0.0, 0.0]), np.pi)
+
+    def motion_of(self, segment: str) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
+        """Function of (n,) seconds: rotations and origins of a segment in ``world``."""
+        place = MODEL.segment_names.index(segment)
+
+        def motion(times: FloatArray) -> tuple[FloatArray, FloatArray]:
+            posture = MODEL.forward(self.course(times).q, self.who.person.lengths)
+            return posture.rotations[:, place], posture.origins[:, place]
+
+        return motion
 
     def frames(self, start: float = 0.0, stop: float | None = None, step: int = 1) -> Iterator[DepthFrame]:
         """Every ``step``-th image from ``start`` to ``stop`` seconds; each has its own random generator."""

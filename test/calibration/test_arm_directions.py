@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from body_tracking.calibration.arm_directions import KINECT_V2, ArmLaw, corrected_arms, turn_arms
 from body_tracking.calibration.joint_centres import body_axes
-from body_tracking.core.skeleton import BONES, MIRROR, FloatArray, Joint, Skeleton, TrackingState
-from walkers import performed
+from body_tracking.core.skeleton import BONES, MIRROR, FloatArray, Joint, TrackingState
+from walkers import performed, tracked
 
 POSE = performed("reaching", np.array([6.0]))[0]
 RNG = np.random.default_rng(1)
@@ -21,10 +21,6 @@ def random_directions(count: int) -> FloatArray:
     """(n, 2, 3) unit vectors."""
     vectors = RNG.normal(size=(count, 2, 3))
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
-
-
-def skeleton(positions: FloatArray) -> Skeleton:
-    return Skeleton(1, "world", positions, np.full(25, TrackingState.TRACKED, dtype=np.uint8))
 
 
 def arms(positions: FloatArray) -> FloatArray:
@@ -67,31 +63,31 @@ def test_the_fit_finds_a_law_again_and_subjects_weigh_alike() -> None:
 
 def test_correction_turns_arms_alone_keeps_lengths_and_follows_the_body() -> None:
     body = POSE
-    found = corrected_arms(skeleton(body)).positions
+    found = corrected_arms(tracked(body)).positions
     still = [joint for joint in Joint if joint not in MOVED]
     assert np.array_equal(found[still], body[still])
     for parent, child in BONES:
         assert np.linalg.norm(found[child] - found[parent]) == pytest.approx(np.linalg.norm(body[child] - body[parent]))
     assert np.allclose(turn_arms(found, body_axes(found), KINECT_V2.measured), body)
     turn = Rotation.from_euler("xyz", [0.3, -0.8, 2.0])
-    assert np.allclose(corrected_arms(skeleton(turn.apply(body) + 1.0)).positions, turn.apply(found) + 1.0)
+    assert np.allclose(corrected_arms(tracked(turn.apply(body) + 1.0)).positions, turn.apply(found) + 1.0)
 
 
 def test_left_is_the_mirror_of_right() -> None:
     body = POSE
     mirrored = (body * [1.0, -1.0, 1.0])[MIRROR]
     assert np.allclose(
-        corrected_arms(skeleton(mirrored)).positions,
-        (corrected_arms(skeleton(body)).positions * [1.0, -1.0, 1.0])[MIRROR],
+        corrected_arms(tracked(mirrored)).positions,
+        (corrected_arms(tracked(body)).positions * [1.0, -1.0, 1.0])[MIRROR],
     )
     law_of_right = KINECT_V2.anatomical(arms(body)[1] / np.linalg.norm(arms(body)[1], axis=-1, keepdims=True))
-    found = arms(corrected_arms(skeleton(body)).positions)[1]
+    found = arms(corrected_arms(tracked(body)).positions)[1]
     assert np.allclose(found / np.linalg.norm(found, axis=-1, keepdims=True), law_of_right)
 
 
 @pytest.mark.parametrize("missing", [Joint.SPINE_MID, Joint.SHOULDER_LEFT, Joint.ELBOW_RIGHT, Joint.WRIST_RIGHT])
 def test_unknown_joints_leave_the_others_unchanged(missing: Joint) -> None:
-    frame = skeleton(POSE.copy())
+    frame = tracked(POSE.copy())
     frame.positions[missing] = np.nan
     frame.states[missing] = TrackingState.NOT_TRACKED
     found = corrected_arms(frame).positions

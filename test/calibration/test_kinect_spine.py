@@ -16,14 +16,10 @@ from body_tracking.filters import ModelFilter, make_filter
 from body_tracking.kinematics.conventions import angles_of
 from body_tracking.kinematics.positional import positional_angles
 from draws import some
-from walkers import performed
+from walkers import performed, tracked
 
 BODY = performed("reaching", np.array([6.0]))[0]
 MOVED = [Joint.SPINE_BASE, Joint.SPINE_MID, Joint.SPINE_SHOULDER, Joint.NECK, Joint.HEAD]
-
-
-def skeleton(positions: FloatArray) -> Skeleton:
-    return Skeleton(1, "world", positions, np.full(25, TrackingState.TRACKED, dtype=np.uint8))
 
 
 def base_above_hips(each: Skeleton) -> FloatArray:
@@ -54,32 +50,32 @@ def test_real_people_have_their_spine_above_the_hips_and_stand_upright(shared_da
 
 
 def test_only_the_spine_moves_and_the_thorax_keeps_its_direction() -> None:
-    found = corrected_spine(skeleton(BODY)).positions
+    found = corrected_spine(tracked(BODY)).positions
     still = [joint for joint in Joint if joint not in MOVED]
     assert np.array_equal(found[still], BODY[still])
     assert np.allclose(body_axes(found), body_axes(BODY))
     away = np.linalg.norm(found - BODY, axis=1)[MOVED]
     assert away == pytest.approx([np.hypot(0.036, 0.029), 0.027, 0.027, 0.027, 0.027])
-    before, after = positional_angles(skeleton(BODY)), positional_angles(skeleton(found))
+    before, after = positional_angles(tracked(BODY)), positional_angles(tracked(found))
     arms = [name.startswith(("shoulder", "humeral", "elbow")) for name in before.names]
     assert np.allclose(after.position[arms], before.position[arms])
 
 
 def test_the_correction_turns_with_the_body_and_left_is_the_mirror_of_right() -> None:
-    found = corrected_spine(skeleton(BODY)).positions
+    found = corrected_spine(tracked(BODY)).positions
     turn = Rotation.from_euler("xyz", [0.3, -0.8, 2.0])
-    assert np.allclose(corrected_spine(skeleton(turn.apply(BODY) + 1.0)).positions, turn.apply(found) + 1.0)
+    assert np.allclose(corrected_spine(tracked(turn.apply(BODY) + 1.0)).positions, turn.apply(found) + 1.0)
     mirrored = (BODY * [1.0, -1.0, 1.0])[MIRROR]
-    assert np.allclose(corrected_spine(skeleton(mirrored)).positions, (found * [1.0, -1.0, 1.0])[MIRROR])
+    assert np.allclose(corrected_spine(tracked(mirrored)).positions, (found * [1.0, -1.0, 1.0])[MIRROR])
 
 
 @pytest.mark.parametrize("missing", [Joint.SPINE_MID, Joint.SHOULDER_LEFT, Joint.HIP_RIGHT, Joint.HEAD])
 def test_a_missing_joint_leaves_the_others_where_they_were(missing: Joint) -> None:
     """But for the angle between pelvis and thorax, of which one stands for the other; SpineMid is needed for both."""
-    frame = skeleton(BODY.copy())
+    frame = tracked(BODY.copy())
     frame.positions[missing] = np.nan
     frame.states[missing] = TrackingState.NOT_TRACKED
-    found, whole = corrected_spine(frame).positions, corrected_spine(skeleton(BODY)).positions
+    found, whole = corrected_spine(frame).positions, corrected_spine(tracked(BODY)).positions
     assert np.array_equal(np.isfinite(found), np.isfinite(frame.positions))
     if missing == Joint.SPINE_MID:
         assert np.array_equal(found, frame.positions, equal_nan=True)

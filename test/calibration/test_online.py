@@ -32,7 +32,7 @@ from body_tracking.recording.calibrate import HISTORY_S, relative_yaw
 from body_tracking.simulation.layouts import around
 from body_tracking.simulation.scene import Setup, simulate
 from draws import draws, some
-from walkers import about_y, frame, walk
+from walkers import about_y, degrees_between, frame, walk
 
 Change = Callable[[Skeleton], Skeleton]
 
@@ -168,7 +168,7 @@ def test_a_known_motion_and_clock_are_recovered(shared_data: Path, name: str, of
     rotation, translation = between(plain)
     found, placed = between(moved)
     expected = rotation @ turn.T
-    assert np.degrees(Rotation.from_matrix(found @ expected.T).magnitude()) < 0.3
+    assert degrees_between(found, expected) < 0.3
     assert_allclose(placed, translation - expected @ shift, atol=0.005)
     for at in (0, 40 * NANOSECONDS):
         before = plain.clocks["kinect2"].to_sensor(at) * (1.0 + 1e-6 * ppm) + offset * NANOSECONDS
@@ -284,7 +284,7 @@ def saved_after(seconds: float = 15.0, turned: float = 0.0) -> CalibrationResult
 
 
 def yaw_error(result: CalibrationResult) -> float:
-    return float(np.degrees(Rotation.from_matrix(between(result)[0] @ ROTATION.T).magnitude()))
+    return degrees_between(between(result)[0], ROTATION)
 
 
 def test_a_still_pose_starts_and_movement_refines() -> None:
@@ -598,7 +598,7 @@ def test_a_sensor_that_was_moved_is_calibrated_by_what_it_sees_since_the_request
             assert calibration.status()[1] != "calibrated"
     rotation, translation = between(calibration.result())
     expected = ROTATION @ turn.T
-    assert np.degrees(Rotation.from_matrix(rotation @ expected.T).magnitude()) < 1.0
+    assert degrees_between(rotation, expected) < 1.0
     assert_allclose(translation, TRANSLATION - expected @ shift, atol=0.03)
 
 
@@ -620,7 +620,7 @@ def test_a_sensor_that_is_moved_unnoticed_is_calibrated_anew(degrees: float, whi
     assert 15 * NANOSECONDS < alarmed < 27 * NANOSECONDS
     turn = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
     expected = ROTATION @ turn.T if which == "kinect2" else turn @ ROTATION
-    assert np.degrees(Rotation.from_matrix(between(calibration.result())[0] @ expected.T).magnitude()) < 1.0
+    assert degrees_between(between(calibration.result())[0], expected) < 1.0
 
 
 @pytest.mark.parametrize("name", some(PAIRS))
@@ -656,7 +656,7 @@ def test_a_sensor_that_sees_somebody_else_was_not_moved(motion: str) -> None:
             seen = replace(seen, positions=next(backward).positions)
         calibration.push(sensor, seen, received)
     assert not [event for event in calibration.events if "was moved" in event]
-    assert np.degrees(Rotation.from_matrix(between(calibration.result())[0] @ before.T).magnitude()) < 3.0
+    assert degrees_between(between(calibration.result())[0], before) < 3.0
 
 
 def broken(frames: tuple[tuple[str, Skeleton, int], ...]) -> Iterator[tuple[str, Skeleton, int]]:

@@ -14,7 +14,7 @@ from body_tracking.calibration.pairwise import Pairs, estimate, same_sense, star
 from body_tracking.calibration.rigid import CalibrationError, rigid_registration
 from body_tracking.core.skeleton import MIRROR, FloatArray
 from draws import draws
-from walkers import about_y, walk
+from walkers import about_y, degrees_between, walk
 
 ROTATION, TRANSLATION = about_y(-70.0), np.array([2.0, 0.1, 2.2])
 
@@ -34,7 +34,7 @@ def pairs_of(times: FloatArray, offsets: float = 0.0, noise: float = 0.01, seed:
 
 
 def angle_to(rotation: FloatArray) -> float:
-    return float(np.degrees(Rotation.from_matrix(rotation @ ROTATION.T).magnitude()))
+    return degrees_between(rotation, ROTATION)
 
 
 STILL = np.linspace(0.0, 2.5, 25)

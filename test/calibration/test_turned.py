@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
-from scipy.spatial.transform import Rotation
 
 from body_tracking.calibration.pairwise import Pairs
 from body_tracking.calibration.turned import best_estimate, half_turn_from, registration, with_sides_swapped
 from body_tracking.core.skeleton import MIRROR, FloatArray, Joint
-from walkers import about_y, performed
+from walkers import about_y, degrees_between, performed
 
 ROTATION, TRANSLATION = about_y(-45.0), np.array([1.5, 0.1, 0.6])
 TO_OPTICAL = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
@@ -35,7 +34,7 @@ def pairs_of(motion: str, turned: float, seed: int = 0) -> Pairs:
 
 
 def angle_to(rotation: FloatArray) -> float:
-    return float(np.degrees(Rotation.from_matrix(rotation @ ROTATION.T).magnitude()))
+    return degrees_between(rotation, ROTATION)
 
 
 @pytest.mark.parametrize("motion", ["shoulder_lifts", "hair_combing", "standing_still"])

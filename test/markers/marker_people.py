@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from markers_lab import random_joint
 from scipy.spatial.transform import Rotation
 
 from body_tracking.core.skeleton import FloatArray
-from body_tracking.markers.joint_model import SIZE, Joint, JointKind, conventional, nearest_turns
+from body_tracking.markers.joint_model import JointKind, nearest_turns
 from body_tracking.markers.joint_tree import Posture, Tree, place, tree_of
 from body_tracking.markers.observations import TargetPose
 
@@ -31,19 +32,6 @@ def pose_covariances(rotations: FloatArray, scale: float = 1.0) -> FloatArray:
         derivative[..., 2, 3], derivative[..., 2, 4] = y, -x
         information += derivative.swapaxes(-1, -2) @ ((scale * BALL_NOISE) ** -2 * np.eye(3)) @ derivative
     return np.linalg.inv(information)
-
-
-def random_joint(rng: np.random.Generator, kind: JointKind, name: str, parent: str, child: str) -> Joint:
-    """A joint about 120 mm from both targets, by the conventions."""
-
-    def centre() -> FloatArray:
-        direction = rng.normal(size=3)
-        return rng.uniform(0.09, 0.15) * direction / np.linalg.norm(direction)
-
-    ball = kind is JointKind.BALL
-    frames = [np.eye(3) if ball else Rotation.random(random_state=rng).as_matrix() for _ in range(2)]
-    joint = Joint(name, parent, child, kind, frames[0], centre(), frames[1], centre(), np.zeros((SIZE, SIZE)))
-    return conventional(joint)[0]
 
 
 def random_posture(

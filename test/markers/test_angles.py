@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from marker_people import measured, random_joint, random_posture
+from marker_people import measured, random_posture
+from markers_lab import random_joint
 from scipy.spatial.transform import Rotation
 
 from body_tracking.core import so3

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from marker_people import measured, random_joint, random_posture
+from marker_people import measured, random_posture
+from markers_lab import random_joint
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 

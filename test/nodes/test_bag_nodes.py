@@ -42,6 +42,7 @@ from body_tracking.recording.rosbag2 import (  # noqa: E402
     serialize,
 )
 from draws import some  # noqa: E402
+from excerpts import contents  # noqa: E402
 
 Stored = tuple[str, bytes, int]
 
@@ -82,8 +83,7 @@ def write_bag(folder: Path, count: int) -> list[Stored]:
 
 
 def read_bag(path: Path) -> list[Stored]:
-    with BagReader(path) as reader:
-        return [(found.topic, found.cdr, found.log_time_ns) for found in reader.messages()]
+    return [(found.topic, found.cdr, found.log_time_ns) for found in contents(path)]
 
 
 def read_so_far(path: Path) -> list[Stored]:

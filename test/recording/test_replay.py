@@ -52,25 +52,19 @@ from body_tracking.recording.rosbag2 import (
     BagError,
     BagReader,
     BagWriter,
-    RawMessage,
     deserialize,
 )
 from body_tracking.recording.summary import summary
 from body_tracking.simulation.bags import write_bag
 from body_tracking.simulation.scene import Setup, simulate
 from draws import some
-from excerpts import beginning
+from excerpts import beginning, contents
 from patience import PATIENCE
 from pose_networks import MISSING, REASON
 
 ROOT = Path(__file__).resolve().parents[2]
 BAG = ROOT / "bags" / "tpose_wave"
 ANGLES = "/humans/bodies/body1/joint_states"
-
-
-def contents(bag: Path) -> list[RawMessage]:
-    with BagReader(bag) as reader:
-        return list(reader.messages())
 
 
 def reference_frames(recording: Path) -> int:

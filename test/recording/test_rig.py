@@ -11,9 +11,10 @@ from body_tracking.core import names
 from body_tracking.pipeline import graph
 from body_tracking.recording.replay import ReplaySettings, replay
 from body_tracking.recording.rig import RigReader
-from body_tracking.recording.rosbag2 import BagReader, BagWriter, RawMessage
+from body_tracking.recording.rosbag2 import BagReader, BagWriter
 from body_tracking.ros.doctor import PROBLEM
 from body_tracking.ros.doctor import bag as examined
+from excerpts import contents
 
 
 def copied(bag: Path, folder: Path, *namespaces: str) -> Path:
@@ -27,11 +28,6 @@ def copied(bag: Path, folder: Path, *namespaces: str) -> Path:
                 topic = names.resolved(message.topic, namespace)
                 writer.write(topic, message.cdr, message.log_time_ns, message.publish_time_ns)
     return folder
-
-
-def contents(bag: Path) -> list[RawMessage]:
-    with BagReader(bag) as reader:
-        return list(reader.messages())
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +12,7 @@ import pytest
 pytest.importorskip("viser", reason="viser is not installed")
 
 from target_points import measure
+from viewer_page import page_with
 
 from body_tracking.core.errors import BodyTrackingError
 from body_tracking.markers import setup
@@ -29,13 +30,6 @@ from body_tracking.viewing.snapshot import Seen, Snapshot
 
 START_NS, PERIOD_NS = 1_750_000_000_000_000_000, 33_333_333
 NOBODY = Seen((), stale=True)
-
-
-class Nobody:
-    """A target for the page's controls without effect."""
-
-    def __getattr__(self, name: str) -> Any:
-        return lambda *given: ""
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +53,7 @@ def view(folder: Path) -> MarkerView:
 
 @pytest.fixture(scope="module")
 def page(view: MarkerView) -> Iterator[Page]:
-    made = Page("127.0.0.1", 0, (), cast(Any, Nobody()), ("ekf",), ("model",), 5.0, (), (view,))
+    made = page_with(view)
     yield made
     made.close()
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
 
 pytest.importorskip("viser", reason="viser is not installed")
+
+from viewer_page import page_with
 
 from body_tracking.core import so3
 from body_tracking.core.camera import Camera
@@ -20,7 +22,6 @@ from body_tracking.mesh.topics import depth_topic, info_topic, mesh_topic
 from body_tracking.messages.codecs import CameraInfo
 from body_tracking.recording.rosbag2 import BAG_WIRE
 from body_tracking.viewing.mesh_view import MeshView
-from body_tracking.viewing.page import Page
 
 CAMERA = Camera("camera", 128, 106, np.array([[92.0, 0.0, 64.0], [0.0, 92.0, 53.0], [0.0, 0.0, 1.0]]), np.zeros(5))
 IMAGES, INFO, MESH = depth_topic("kinect1"), info_topic("kinect1"), mesh_topic("kinect1")
@@ -28,13 +29,6 @@ POSES = {"kinect1_mesh": SensorPose("kinect1_mesh", np.array([1.0, 2.0, 3.0]), s
 PERIOD_NS = 33_333_333
 OUTLINE = 240
 """Least brightness of the darkest channel of the outline; no colour of a distance is so white."""
-
-
-class Nobody:
-    """A target for the page's controls without effect."""
-
-    def __getattr__(self, name: str) -> Any:
-        return lambda *given: ""
 
 
 class Clock:
@@ -52,7 +46,7 @@ def clock() -> Clock:
 @pytest.fixture
 def view(clock: Clock) -> Iterator[MeshView]:
     made = MeshView(("kinect1",), clock)
-    page = Page("127.0.0.1", 0, (), cast(Any, Nobody()), ("ekf",), ("model",), 5.0, (), (made,))
+    page = page_with(made)
     yield made
     page.close()
 
