@@ -59,8 +59,11 @@ GATE = 3.5
 REACQUIRE = 0.3
 """... unless a sensor has reported it there for this long, seconds."""
 
+_SLOW = 0.04
+"""Period from which a sensor is slow, seconds."""
+
 _MISSED = 2.5
-"""Periods without a frame after which a slow sensor is silent: one frame may be lost."""
+"""Periods without a frame after which a slow sensor is silent, at the earliest: one frame may be lost."""
 
 _LONGEST_PERIOD = 1.0
 """Longest time between two frames that is taken for a sensor's period, seconds; a longer one is an absence."""
@@ -82,7 +85,11 @@ class FusionParameters:
         },
     )
     silence: float = number_field(
-        0.1, "drop a sensor whose newest frame is older than this and than 2.5 of its periods", "s", 0.02, 5.0
+        0.1,
+        "drop a sensor whose newest frame is older than this; below 25 frames a second, than 2.5 periods if longer",
+        "s",
+        0.02,
+        5.0,
     )
     max_wait: float = number_field(
         0.05, "wait at most this long for another sensor's frame that is due; 0 for the least delay", "s", 0.0, 1.0
@@ -264,7 +271,8 @@ class Fusion(PlacedSensors[_Sensor]):
 
     def _silence_of(self, source: _Sensor) -> float:
         """Seconds without a frame after which a sensor is silent; more than ``silence`` for one that is slow."""
-        return max(self.parameters.silence, _MISSED * source.rhythm.period)
+        period = source.rhythm.period
+        return self.parameters.silence if period < _SLOW else max(self.parameters.silence, _MISSED * period)
 
     def poll(self, now_ns: int) -> list[Skeleton]:
         """The fused skeletons whose wait is over."""
