@@ -142,7 +142,7 @@ def add_options(parser: argparse.ArgumentParser, *names: str, **texts: str) -> N
             metavar = option.metavar or None
             if choices and len(joined := ", ".join(choices)) > _WIDTH:
                 metavar, text = option.name.upper(), f"{text}; one of {joined}"
-            number = isinstance(option.default, int | float) and option.name != "people"  # 0 is no number of people
+            number = isinstance(option.default, int | float) and option.least is None
             default = option.default if number else None
             action = SinglePath if option.path else "store"
             group.add_argument(
@@ -154,7 +154,7 @@ def options_from(args: argparse.Namespace) -> dict[str, Value]:
     """The options that a command line sets; others are left out.
 
     Raises:
-        GraphError: a list of sensors without a name, or nobody to track.
+        GraphError: a list of sensors without a name, or a number below the least one.
     """
     found: dict[str, Value] = {}
     for name, option in OPTIONS.items():
@@ -165,8 +165,8 @@ def options_from(args: argparse.Namespace) -> dict[str, Value]:
             value = tuple(part for each in value for part in each.split(",") if part)
         if name == "sensors" and not value:
             raise graph.GraphError("sensors: no name")
-        if name == "people" and value == option.default:  # which stands for the largest number
-            raise graph.GraphError(f"people: {value}, expected 1 or more")
+        if option.least is not None and isinstance(value, int) and value < option.least:
+            raise graph.GraphError(f"{name}: {value}, expected {option.least} or more")
         if name == "sensors" and value == (graph.NO_SENSORS,):
             value = ()
         found[name] = tuple(value) if isinstance(option.default, tuple) else str(value) if option.path else value

@@ -30,7 +30,7 @@ from body_tracking.pipeline.people import HOLD
 from body_tracking.pipeline.shared import names_in, sensors_of
 from body_tracking.pipeline.stage import Port
 
-_AWAY_NS = round(HOLD * NANOSECONDS)
+AWAY_NS = round(HOLD * NANOSECONDS)
 """Nanoseconds without a frame or an orientation after which the next ones may be of another person."""
 
 
@@ -146,11 +146,11 @@ class PersonFilter:
         if self._corrects_fused:
             skeleton = corrected_kinect(skeleton)
         self.tracked = True
-        if self._model_filter is None:
-            self._see(skeleton.stamp_ns)
         if self._model_filter is not None:
             self._take([("", skeleton)], now_ns)
-        elif (filtered := self._filter.update(skeleton)) is None:
+            return
+        self._see(skeleton.stamp_ns)
+        if (filtered := self._filter.update(skeleton)) is None:
             return
         elif self._lag is not None:
             self._hold_back(self._lag, filtered, now_ns)
@@ -254,7 +254,7 @@ class PersonFilter:
     def _see(self, stamp_ns: int) -> None:
         """Note that the person was seen, by a camera or a worn sensor; after a longer absence it may be another one."""
         last_ns = self._seen_ns
-        if last_ns is not None and stamp_ns - last_ns > _AWAY_NS and isinstance(self._filter, LearningFilter):
+        if last_ns is not None and stamp_ns - last_ns > AWAY_NS and isinstance(self._filter, LearningFilter):
             self.flush()
             self._filter.forget_joint_centres()
         if last_ns is None or stamp_ns > last_ns or jumped_back(stamp_ns, last_ns):

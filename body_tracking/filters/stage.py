@@ -13,7 +13,7 @@ from typing import Any
 from body_tracking.core.orientation import SEGMENT_NUMBER, OrientationError, SegmentOrientation
 from body_tracking.core.parameters import Parameter, Value, fields_of, parameters_from
 from body_tracking.core.qos import RELIABLE as RELIABLE_QOS
-from body_tracking.core.skeleton import NANOSECONDS, Skeleton
+from body_tracking.core.skeleton import Skeleton
 from body_tracking.filters import (
     DEFAULT_FILTER,
     FILTERS,
@@ -22,7 +22,7 @@ from body_tracking.filters import (
     parameter_prefix,
     prepare,
 )
-from body_tracking.filters.person import PersonFilter
+from body_tracking.filters.person import AWAY_NS, PersonFilter
 from body_tracking.filters.smoothing import MAX_LAG
 from body_tracking.fusion.people import People
 from body_tracking.fusion.stage import calibration_inputs
@@ -31,7 +31,7 @@ from body_tracking.messages.codecs import (
     Orientation,
 )
 from body_tracking.pipeline import graph
-from body_tracking.pipeline.people import ALL, HOLD, PEOPLE, people_from
+from body_tracking.pipeline.people import ALL, PEOPLE, people_from
 from body_tracking.pipeline.roles import role_of
 from body_tracking.pipeline.shared import (
     BODY,
@@ -150,8 +150,6 @@ _CALIBRATIONS = 1000
 """Queue of poses and clocks, long enough that none is lost while the filter is busy."""
 _ORIENTATIONS = 32
 """Queue of orientations per segment: half a second."""
-_AWAY = round(HOLD * NANOSECONDS)
-"""Nanoseconds without a fused frame of one of several people after which that person is forgotten."""
 
 
 class FilterStage(Stage):
@@ -320,7 +318,7 @@ class FilterStage(Stage):
     def _take_several(self, skeletons: Sequence[Skeleton], now_ns: int) -> None:
         stamp_ns = skeletons[0].stamp_ns
         for number, last_ns in list(self._last_ns.items()):
-            if stamp_ns - last_ns > _AWAY:  # another person may have the number now
+            if stamp_ns - last_ns > AWAY_NS:  # another person may have the number now
                 self._gone(number)
         for skeleton in skeletons:
             if 1 <= skeleton.body <= len(self._persons):

@@ -288,13 +288,12 @@ class Sides:
 
     def _expected(self, stamp: int, name: str, headings: Sequence[float], weights: Sequence[float]) -> float:
         """The sense in which a sensor should see the body: as in its last frame, unless it swapped left and right."""
+        sense = math.copysign(1.0, self._sense(headings, weights))
         view = self._views.get(name)
-        fresh = view is not None and stamp - view.stamp <= VIEW_KEPT
-        kept = _agreement(headings, view.headings, weights) if view is not None and fresh else None
-        if view is None or kept is None:
-            sense = math.copysign(1.0, self._sense(headings, weights))
-        else:
-            sense = view.sense if kept > 0.0 else -view.sense
+        if view is not None and stamp - view.stamp <= VIEW_KEPT:
+            kept = _agreement(headings, view.headings, weights)
+            if kept is not None:
+                sense = view.sense if kept > 0.0 else -view.sense
         self._views[name] = _View(stamp, headings, sense)
         return sense
 

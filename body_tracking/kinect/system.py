@@ -176,6 +176,7 @@ SYSTEM = System(
             "N",
             parameter=("skeleton_filter", "people"),
             offline=True,
+            least=1,
         ),
     ),
     topics=(

@@ -54,6 +54,7 @@ class Option:
         hidden: no command has it, only the parameters file.
         offline: ``replay`` has it, too.
         source: given a value, the graph has further sensors beside those of the option ``sensors``.
+        least: the least number that may be given; None for any. A smaller default stands for no choice.
         example: a value with which a graph has the nodes that depend on it, for lists of all nodes.
     """
 
@@ -67,6 +68,7 @@ class Option:
     hidden: bool = False
     offline: bool = False
     source: bool = False
+    least: int | None = None
     example: Value | None = None
 
 

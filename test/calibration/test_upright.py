@@ -35,9 +35,8 @@ def standing(seconds: float = 2.5) -> FloatArray:
     return positions + np.random.default_rng(0).normal(scale=0.005, size=positions.shape)
 
 
-def after(positions: FloatArray, calibration: OnlineCalibration) -> tuple[int, str]:
-    """Level and text of the calibration's state after these frames of its reference sensor, and others."""
-    begun = len(calibration._track.stamps) / 30
+def after(positions: FloatArray, calibration: OnlineCalibration, begun: float = 0.0) -> tuple[int, str]:
+    """Level and text of the calibration's state after these frames of its reference sensor, from a time in seconds."""
     for number, each in enumerate(positions):
         seen = frame(begun + number / 30, each)
         calibration.push("kinect1", seen, seen.stamp_ns)
@@ -81,13 +80,14 @@ def test_who_sits_bends_or_moves_shows_nothing() -> None:
 def test_it_is_said_once_people_have_stood_three_times_and_not_after_it_is_set() -> None:
     calibration, seen = OnlineCalibration(("kinect1",)), tilted(standing(8.0), 12.0, 0.0)
     assert after(seen[:120], calibration) == (0, "calibrated")
-    level, text = after(seen[120:], calibration)
+    level, text = after(seen[120:], calibration, 4.0)
     assert level == 1 and text.startswith("people stand tilted by 1")
     pitch, roll = angles_in(text)
     given = replace(calibration.parameters, reference_pitch=pitch, reference_roll=roll)
     assert after(seen, OnlineCalibration(("kinect1",), given)) == (0, "calibrated")
     calibration.start()  # maybe since the sensor was moved
-    assert after(standing(), calibration) == (0, "calibrated")
+    assert after(standing(8.0), calibration, 8.0) == (0, "calibrated")
+    assert after(seen, calibration, 16.0)[0] == 1
 
 
 @pytest.mark.parametrize("name", some(PAIRS))
