@@ -63,6 +63,7 @@ class Benchmark(NamedTuple):
 
 BENCHMARKS = {
     "real_pairs": Benchmark(5, PAIRS, "--ekf"),
+    "lab_faults": Benchmark(3, PAIRS),
     "real_angles": Benchmark(5, PAIRS),
     "kinect_vs_vicon": Benchmark(1, recordings("kinect_vs_vicon")),
     "baseline": Benchmark(4),
