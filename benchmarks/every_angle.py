@@ -9,6 +9,7 @@ motions and seeds are those of the table in docs/accuracy.md; no filter was tune
   python benchmarks/every_angle.py --sensors kinect1 --motions walking_and_turning --seeds 6   the first one alone
   python benchmarks/every_angle.py --set posture=false    ``ekf`` with a mechanism switched off
   python benchmarks/every_angle.py --imus pelvis upper_trunk   with inertial sensors, which ``ekf`` takes
+  python benchmarks/every_angle.py --unseen legs     as behind a table: nothing is seen below the waist
 """
 
 from __future__ import annotations
@@ -24,8 +25,9 @@ import common
 import numpy as np
 from accuracy import Run
 
-from body_tracking.core.skeleton import FloatArray
+from body_tracking.core.skeleton import FloatArray, Joint, TrackingState
 from body_tracking.core.so3 import wrapped
+from body_tracking.core.sources import RecordedFrame
 from body_tracking.evaluation.reading import AngleSeries, nearest, read
 from body_tracking.filters import DEFAULT_FILTER
 from body_tracking.kinematics.conventions import CONVENTIONS
@@ -36,19 +38,35 @@ from body_tracking.simulation.repertoire import MOTIONS
 FILTERS = (DEFAULT_FILTER, "ekf")
 LAYOUTS = (2, 4)
 _FIRST_SEED = 9700
+_LEGS = "SPINE_BASE", "HIP", "KNEE", "ANKLE", "FOOT"
+UNSEEN = {"": (), "legs": _LEGS, "trunk": (*_LEGS, "SPINE_MID")}
+"""Beginnings of the names of joints that no sensor sees."""
+
+
+def filters_for(unseen: str) -> tuple[str, ...]:
+    """The filters compared; without a trunk the default one has no model's angles."""
+    return FILTERS[1:] if unseen == "trunk" else FILTERS
+
 
 Errors = dict[str, dict[str, tuple[FloatArray, FloatArray]]]
 """By filter and angle without its side: (n,) errors and (n,) stated standard deviations, radians."""
 
 
 def errors_of(
-    convention: str, sensors: tuple[str, ...], imus: tuple[str, ...], ekf: Mapping[str, float], run: Run
+    convention: str,
+    sensors: tuple[str, ...],
+    imus: tuple[str, ...],
+    unseen: str,
+    ekf: Mapping[str, float],
+    run: Run,
 ) -> Errors:
     """The errors of one person's angles, with these parameters of ``ekf``."""
     found: Errors = {}
     with tempfile.TemporaryDirectory() as folder:
-        write_bag(run.recording(imus=imus), Path(folder) / "in")
-        for name in FILTERS:
+        recording = run.recording(imus=imus)
+        seen = tuple(without(each, UNSEEN[unseen]) for each in recording.frames)
+        write_bag(replace(recording, frames=seen), Path(folder) / "in")
+        for name in filters_for(unseen):
             out = Path(folder) / name
             given = {"skeleton_filter": {f"ekf.{key}": value for key, value in ekf.items()}}
             worn = tuple(f"{each}:imu_{each}" for each in imus)
@@ -63,6 +81,17 @@ def errors_of(
                 for kind in dict.fromkeys(kinds)
             }
     return found
+
+
+def without(frame: RecordedFrame, unseen: tuple[str, ...]) -> RecordedFrame:
+    """A frame in which joints whose names begin so are not tracked."""
+    rows = [joint for joint in Joint if unseen and joint.name.startswith(unseen)]
+    found = []
+    for seen in frame.skeletons:
+        positions, states = seen.positions.copy(), seen.states.copy()
+        positions[rows], states[rows] = np.nan, TrackingState.NOT_TRACKED
+        found.append(replace(seen, positions=positions, states=states))
+    return replace(frame, skeletons=tuple(found))
 
 
 def against_truth(
@@ -119,23 +148,30 @@ def main() -> int:
     parser.add_argument("--convention", choices=list(CONVENTIONS), default="isb", help="default: %(default)s")
     parser.add_argument("--sensors", nargs="+", default=[], metavar="NAME", help="default: both")
     parser.add_argument("--imus", nargs="+", default=[], metavar="SEGMENT", help="segments with inertial sensors")
+    parser.add_argument("--unseen", choices=list(UNSEEN), default="", help="parts of the body that no sensor sees")
     common.add_set(parser)
     args = parser.parse_args()
     cases = [(motion, layout) for motion in args.motions for layout in LAYOUTS for _ in range(args.seeds)]
     runs = [Run(motion, layout, _FIRST_SEED + number) for number, (motion, layout) in enumerate(cases)]
-    work = functools.partial(errors_of, args.convention, tuple(args.sensors), tuple(args.imus), dict(args.set))
+    work = functools.partial(
+        errors_of, args.convention, tuple(args.sensors), tuple(args.imus), args.unseen, dict(args.set)
+    )
     people = common.mapped(work, runs, args.jobs)
     figures = {
-        name: {kind: figures_of([each[name][kind] for each in people]) for kind in people[0][name]} for name in FILTERS
+        name: {kind: figures_of([each[name][kind] for each in people]) for kind in people[0][name]}
+        for name in filters_for(args.unseen)
     }
     met = {}
     for name, rows in figures.items():
         met[f"{name}: every angle finite in 99 %"] = min(row["finite"] for row in rows.values()) >= 0.99
         low = {kind: row["covered"] for kind, row in rows.items() if row["covered"] < 0.9}
         met[f"{name}: every angle covered in 90 %{'; not ' + ', '.join(low) if low else ''}"] = not low
-    default = figures[DEFAULT_FILTER]
-    worse = [kind for kind, row in figures["ekf"].items() if row["rmse"] > default[kind]["rmse"]]
-    met[f"ekf: no angle worse than with the default filter{'; not ' + ', '.join(worse) if worse else ''}"] = not worse
+    if DEFAULT_FILTER in figures:
+        default = figures[DEFAULT_FILTER]
+        worse = [kind for kind, row in figures["ekf"].items() if row["rmse"] > default[kind]["rmse"]]
+        met[
+            f"ekf: no angle worse than with the default filter{'; not ' + ', '.join(worse) if worse else ''}"
+        ] = not worse
     for rows in figures.values():
         columns = next(iter(rows.values()))
         rows["mean"] = {column: float(np.mean([row[column] for row in rows.values()])) for column in columns}

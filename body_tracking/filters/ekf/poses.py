@@ -15,6 +15,8 @@ from body_tracking.filters.ekf.state import NOBODY, Measurement, SensorState, St
 from body_tracking.kinematics.inverse import InverseKinematics
 from body_tracking.kinematics.lengths import SegmentLengths
 
+_LONG_NS = 60 * NANOSECONDS
+"""Age of the last measurement of a point that has had none."""
 _REST_NS = NANOSECONDS // 4
 """Least time between searches for another pose."""
 _MISFIT = 0.02
@@ -92,10 +94,11 @@ class PoseSearch:
         *,
         keep_lengths: bool = True,
     ) -> State:
-        """A state at rest, with the covariance of a fit to points of these standard deviations (19,), in metres."""
+        """A state at rest, with the covariance of a fit to points of these deviations (19,), metres; inf: unseen."""
         space = self._space
         lines = self._model.linearised(q, lengths)
-        weights = np.where(np.isfinite(stddev), 1.0 / stddev**2, 0.0)
+        seen = np.isfinite(stddev)
+        weights = np.where(seen, 1.0 / stddev**2, 0.0)
         by_tangent = lines.jacobian.reshape(-1, space.nv)
         by_length = lines.length_jacobian.reshape(-1, space.nl)
         weighted = by_tangent * np.repeat(weights, 3)[:, None]
@@ -132,7 +135,7 @@ class PoseSearch:
             np.zeros(space.points),
             np.zeros(3 * space.points),
             np.zeros(space.observed),
-            np.full(space.points, stamp_ns, dtype=np.intp),
+            np.where(seen | ~seen.any(), stamp_ns, stamp_ns - _LONG_NS if previous is None else previous.used_ns),
             0.0,
             0.0 if previous is None else previous.tracked,
             False if previous is None else previous.settled,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from body_tracking.core.skeleton import FloatArray, SingleArray
+from body_tracking.core.skeleton import NANOSECONDS, FloatArray, SingleArray
 from body_tracking.filters.ekf.kernels import pseudo_measured
 from body_tracking.filters.ekf.parameters import EkfParameters
 from body_tracking.filters.ekf.state import State, StateSpace, single
@@ -22,8 +22,13 @@ VAGUE = 0.5
 """Share of the range's deviation from which an angle is moved to the middle of its range."""
 _SPURIOUS = 0.7
 """Share of the range's variance below which the variance of an unobserved direction is spurious."""
+_SEEN_NS = NANOSECONDS
+"""Nanoseconds since its last accepted measurement after which a point no longer counts as seen."""
+_UNSEEN_PLACE, _UNSEEN_HEADING = 1.0, 1.0
+"""Metres and radians: deviations of a base of which nothing was seen lately, as with one hand in view; a longer absence
+adds what the motion model says."""
 _NULL = 1e-6
-"""Singular value, as a share of the greatest, below which a direction moves no point."""
+"""Singular value, as a share of the greatest, below which a direction moves no seen point."""
 _LIMIT_STDDEV = 3.0
 """Degrees: standard deviation of the pseudo-measurement at a limit."""
 _HARD_STDDEV = 0.2
@@ -51,6 +56,9 @@ class Priors:
         # the pseudo-measurements: coordinates, sharing of a twist, and inclination of the pelvis
         self._stddev = space.prior_table.stddev
         self._postural = np.append(self._prior.postural, [True] * 3)
+        self._information = space.rest_information.copy()
+        self._information[:3] = 1.0 / _UNSEEN_PLACE**2
+        self._information[5] = 1.0 / _UNSEEN_HEADING**2
 
     def bounded(self, state: State) -> State:
         """Update by the ranges of motion: soft limits, and bounds of unobserved directions."""
@@ -107,7 +115,7 @@ class Priors:
         )
 
     def _without_spurious_information(self, state: State) -> State:
-        """Remove spurious information about unobserved directions.
+        """Remove spurious information about unobserved directions, which move no point that was seen lately.
 
         The unobserved directions depend on the estimate, which is noisy; the update takes their rotation from frame to
         frame for information (Huang, Mourikis and Roumeliotis 2010). Along each of them the covariance is raised to a
@@ -115,7 +123,8 @@ class Priors:
         """
         space = self._space
         lines = self._model.linearised(state.q, state.lengths)
-        jacobian = lines.jacobian.reshape(-1, space.nv)
+        recent = state.stamp_ns - state.used_ns < _SEEN_NS
+        jacobian = lines.jacobian[recent if recent.any() else slice(None)].reshape(-1, space.nv)
         if state.sources.names:
             turning = lines.rotation_jacobian[state.sources.segments].reshape(-1, space.nv)
             jacobian = np.concatenate([jacobian, turning])
@@ -126,7 +135,7 @@ class Priors:
             return state
         tangent = state.covariance[space.tangent, space.tangent]
         known = np.linalg.inv(null @ np.linalg.solve(tangent, null.T))
-        allowed = _SPURIOUS * np.linalg.inv((null * space.rest_information) @ null.T)
+        allowed = _SPURIOUS * np.linalg.inv((null * self._information) @ null.T)
         size, directions = np.linalg.eigh(allowed - known)
         missing = (directions * np.maximum(size, 0.0)) @ directions.T
         covariance = state.covariance.copy()

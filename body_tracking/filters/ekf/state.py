@@ -117,7 +117,7 @@ class State(Changeable):
         mean_posture: (29,) mean of the residuals of ``prior_rows`` over the last minute; None in the first tenth of a
             second.
         measured_at: seconds since the start at which its lengths were last applied.
-        null: (k, 32) directions of the tangent that move no point.
+        null: (k, 32) directions of the tangent that move no point seen lately, and no segment of a source.
         fresh: started from a frame, without any after it.
         attempted_ns: stamp of the last search for another pose.
         sources: of orientations.
