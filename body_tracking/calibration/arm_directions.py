@@ -83,14 +83,15 @@ explains at least 0.9 of the variance: ``benchmarks/kinect_vs_vicon.py --fit``."
 
 
 def corrected_arms(skeleton: Skeleton, law: ArmLaw = KINECT_V2) -> Skeleton:
-    """A skeleton of a Kinect v2 with the arms in their anatomical directions; unchanged where the thorax is unknown.
+    """A skeleton of a Kinect v2 with the arms in their anatomical directions; unchanged without shoulders.
 
     Args:
-        skeleton: in any frame; only its positions change.
+        skeleton: in a frame with z up, along which the thorax counts where SpineMid is unknown, as at a table; only its
+            positions change.
         law: eq. (1).
     """
     known = np.where(skeleton.valid[:, None], skeleton.positions, np.nan)
-    turned = turn_arms(known, body_axes(known), law.anatomical)
+    turned = turn_arms(known, body_axes(known, upright=True), law.anatomical)
     return replace(skeleton, positions=np.where(skeleton.valid[:, None], turned, skeleton.positions))
 
 

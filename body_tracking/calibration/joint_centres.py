@@ -175,9 +175,23 @@ def _unit(x: float, y: float, z: float) -> _Vector:
     return x / length, y / length, z / length
 
 
-def body_axes(positions: FloatArray) -> FloatArray:
-    """(3, 3) rotation from forward, left and up of the thorax to the axes of (25, 3) positions; NaN where unknown."""
-    return np.array(trunk_axes(*positions.take(_THORAX, axis=0).tolist())).T
+def body_axes(positions: FloatArray, upright: bool = False) -> FloatArray:
+    """(3, 3) rotation from forward, left and up of the thorax to the axes of (25, 3) positions; NaN where unknown.
+
+    Args:
+        positions: metres, any frame.
+        upright: the frame's z is up, along which the thorax counts where SpineMid is unknown.
+    """
+    top, middle, left, right = positions.take(_THORAX, axis=0).tolist()
+    axes = upright_axes(top, left, right) if upright and math.isnan(middle[2]) else trunk_axes(top, middle, left, right)
+    return np.array(axes).T
+
+
+def upright_axes(
+    top: Sequence[float], left: Sequence[float], right: Sequence[float]
+) -> tuple[_Vector, _Vector, _Vector]:
+    """:func:`trunk_axes` of an upright thorax whose SpineMid is unknown, in a frame with z up."""
+    return trunk_axes(top, (top[0], top[1], top[2] - 1.0), left, right)
 
 
 def posed(positions: FloatArray, local: FloatArray) -> FloatArray:

@@ -20,7 +20,7 @@ from typing import Final
 import numpy as np
 
 from body_tracking.calibration.arm_directions import KINECT_V2, ArmLaw, corrected_arms
-from body_tracking.calibration.joint_centres import trunk_axes
+from body_tracking.calibration.joint_centres import trunk_axes, upright_axes
 from body_tracking.core.skeleton import IntArray, Joint, Skeleton
 
 BASE_FORWARD: Final = 0.036
@@ -41,7 +41,7 @@ def corrected_kinect(skeleton: Skeleton, law: ArmLaw = KINECT_V2) -> Skeleton:
     """A skeleton of a Kinect v2 without the systematic errors of arms and spine that all Kinects v2 share.
 
     Args:
-        skeleton: in any frame; only its positions change.
+        skeleton: in a frame with z up; only its positions change.
         law: corrects the directions of the arms.
     """
     return corrected_spine(corrected_arms(skeleton, law))
@@ -54,9 +54,10 @@ def corrected_spine(skeleton: Skeleton) -> Skeleton:
     behind the side that it takes for the front. A fused frame has correct sides already.
 
     Args:
-        skeleton: in any frame; only its positions change. Where the axes of the pelvis are unknown, those of the thorax
-            replace them, and the other way round: without a correction SpineBase would move by 46 mm whenever a hip is
-            missing, and filters would estimate a velocity. Where both are unknown nothing changes.
+        skeleton: in a frame with z up; only its positions change. Where the axes of the pelvis are unknown, those of
+            the thorax replace them, and the other way round: without a correction SpineBase would move by 46 mm
+            whenever a hip is missing, and filters would estimate a velocity. Where both are unknown the thorax counts
+            as upright; where the shoulders are, too, nothing changes.
     """
     known = np.where(skeleton.valid[:, None], skeleton.positions, np.nan)
     base, middle, top, left_hip, right_hip, left_shoulder, right_shoulder = known.take(_NEEDED, axis=0).tolist()
@@ -67,6 +68,8 @@ def corrected_spine(skeleton: Skeleton) -> Skeleton:
         pelvis = thorax
     if not math.isfinite(thorax[0][0]):
         thorax = pelvis
+    if not math.isfinite(thorax[0][0]):
+        pelvis = thorax = upright_axes(top, left_shoulder, right_shoulder)
     if math.isfinite(pelvis[0][0]):
         forward, _, up = pelvis
         positions[_J.SPINE_BASE] += [BASE_FORWARD * f + BASE_UP * u for f, u in zip(forward, up, strict=True)]

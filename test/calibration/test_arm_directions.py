@@ -92,5 +92,14 @@ def test_unknown_joints_leave_the_others_unchanged(missing: Joint) -> None:
     frame.states[missing] = TrackingState.NOT_TRACKED
     found = corrected_arms(frame).positions
     assert np.array_equal(np.isfinite(found), np.isfinite(frame.positions))
-    thorax = missing in (Joint.SPINE_MID, Joint.SHOULDER_LEFT)
+    thorax = missing == Joint.SHOULDER_LEFT
     assert np.array_equal(found[Joint.ELBOW_LEFT], frame.positions[Joint.ELBOW_LEFT]) == thorax
+
+
+def test_the_thorax_of_a_person_at_a_table_counts_as_upright() -> None:
+    frame, whole = tracked(POSE.copy()), tracked(POSE.copy())
+    frame.positions[Joint.SPINE_MID] = np.nan
+    frame.states[Joint.SPINE_MID] = TrackingState.NOT_TRACKED
+    whole.positions[Joint.SPINE_MID] = POSE[Joint.SPINE_SHOULDER] - [0.0, 0.0, 0.3]
+    seen = [joint for joint in Joint if joint != Joint.SPINE_MID]
+    assert np.allclose(corrected_arms(frame).positions[seen], corrected_arms(whole).positions[seen])
