@@ -321,7 +321,12 @@ class AnglesStage(Stage):
         text = f"{self.convention} angles of {self.source}"
         if self.source == graph.MODEL_INPUT != self._seen:
             return 1, f"{text}, but no filter publishes {self._covariance}", values
+        if fits["no trunk"] > fits["frames"]:
+            return 1, f"{text} need two joints of the spine, which are not seen: {_WITHOUT_TRUNK}", values
         return 0, text, values
+
+
+_WITHOUT_TRUNK = f"filter ekf needs the shoulders alone, convention {graph.POSITIONAL} has the elbows"
 
 
 def _published(body: str, angles: JointAngles) -> tuple[Output, Output]:

@@ -16,8 +16,10 @@ from body_tracking.kinematics.conventions import ALL_CONVENTIONS, ConventionErro
 from body_tracking.kinematics.lengths import LengthChanges
 from body_tracking.kinematics.positional import positional_angles
 from body_tracking.kinematics.skeleton_fit import SkeletonFit
-from body_tracking.kinematics.stage import AngleStream, JumpDoubt
+from body_tracking.kinematics.stage import AnglesStage, AngleStream, JumpDoubt
 from body_tracking.kinematics.upper_body import UNOBSERVED, UpperBody
+from body_tracking.pipeline import graph
+from body_tracking.pipeline.stage import Now
 from draws import draws
 
 MODEL = UpperBody()
@@ -203,3 +205,18 @@ def test_constant_lengths_are_published_once() -> None:
     assert [changes.due(k * NANOSECONDS, np.array([0.3])) for k in range(5)] == [True, False, False, False, False]
     changes.reset()
     assert changes.due(0, np.array([0.3]))
+
+
+def test_angles_that_need_a_trunk_say_so_where_none_is_seen() -> None:
+    given = {"convention": "isb", "input": graph.SKELETON_INPUT}
+    stage = AnglesStage({each.name: each.default for each in AnglesStage.PARAMETERS} | given)
+    for number in range(3):
+        skeleton = seen(number * FRAME)
+        assert [*stage.take(graph.FILTERED, (skeleton,), Now(skeleton.stamp_ns, skeleton.stamp_ns))]
+    assert stage.state(0)[0] == 0
+    for number in range(3, 8):
+        skeleton = seen(number * FRAME)
+        skeleton.states[[Joint.SPINE_MID, Joint.SPINE_BASE]] = TrackingState.NOT_TRACKED
+        assert not [*stage.take(graph.FILTERED, (skeleton,), Now(skeleton.stamp_ns, skeleton.stamp_ns))]
+    level, text, _ = stage.state(0)
+    assert level == 1 and "need two joints of the spine" in text
