@@ -91,7 +91,7 @@ def corrected_arms(skeleton: Skeleton, law: ArmLaw = KINECT_V2) -> Skeleton:
         law: eq. (1).
     """
     known = np.where(skeleton.valid[:, None], skeleton.positions, np.nan)
-    turned = turn_arms(known, body_axes(known, upright=True), law.anatomical)
+    turned = turn_arms(known, body_axes(known), law.anatomical)
     return replace(skeleton, positions=np.where(skeleton.valid[:, None], turned, skeleton.positions))
 
 

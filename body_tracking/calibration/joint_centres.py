@@ -60,7 +60,7 @@ _ARMS: Final[IntArray] = np.array([_LEFT, _RIGHT], dtype=np.intp)
 LEARNT: Final[IntArray] = np.array([*_TRUNK, *_LEFT, *_RIGHT], dtype=np.intp)
 """(11,) joints whose offsets are learnt."""
 _PLACE = {Joint(joint): place for place, joint in enumerate(LEARNT)}
-_NEEDED = np.array([_PLACE[joint] for joint in (*_TRUNK[1:], *_LEFT[:3], *_RIGHT[:3])], dtype=np.intp)
+_NEEDED = np.array([_PLACE[joint] for joint in (*_TRUNK[2:], *_LEFT[:3], *_RIGHT[:3])], dtype=np.intp)
 _FOLLOWERS = {
     _J.SPINE_BASE: (_J.HIP_LEFT, _J.HIP_RIGHT),
     _J.SPINE_SHOULDER: (_J.NECK, _J.HEAD),
@@ -115,6 +115,9 @@ _AXES_STDDEV = 0.3
 """Radians: standard deviation of the measured thorax's axes against the body's, an upper bound."""
 _UNSEEN = 1.0
 """Square metres: variance of a joint that is not seen."""
+
+_SPINE_UNSEEN = (0.0, 0.0, -0.3)
+"""Metres from SpineShoulder, forward, left and up: where an unseen joint counts as seen with ``_UNSEEN``."""
 
 _PRIOR: FloatArray = np.kron(offset_correlation() * BASE_STDDEV * BASE_STDDEV[:, None], np.eye(3)).astype(np.float64)
 """(75, 75) square metres: covariance of the offsets of all joints before a T-pose."""
@@ -175,23 +178,21 @@ def _unit(x: float, y: float, z: float) -> _Vector:
     return x / length, y / length, z / length
 
 
-def body_axes(positions: FloatArray, upright: bool = False) -> FloatArray:
+def thorax_axes(
+    top: Sequence[float], middle: Sequence[float], left: Sequence[float], right: Sequence[float]
+) -> tuple[_Vector, _Vector, _Vector]:
+    """:func:`trunk_axes` of the thorax, in a frame with z up; it counts as upright where SpineMid is unknown."""
+    if math.isnan(middle[2]):
+        middle = top[0], top[1], top[2] - 1.0
+    return trunk_axes(top, middle, left, right)
+
+
+def body_axes(positions: FloatArray) -> FloatArray:
     """(3, 3) rotation from forward, left and up of the thorax to the axes of (25, 3) positions; NaN where unknown.
 
-    Args:
-        positions: metres, any frame.
-        upright: the frame's z is up, along which the thorax counts where SpineMid is unknown.
+    Without SpineMid the positions' z has to be up: see :func:`thorax_axes`.
     """
-    top, middle, left, right = positions.take(_THORAX, axis=0).tolist()
-    axes = upright_axes(top, left, right) if upright and math.isnan(middle[2]) else trunk_axes(top, middle, left, right)
-    return np.array(axes).T
-
-
-def upright_axes(
-    top: Sequence[float], left: Sequence[float], right: Sequence[float]
-) -> tuple[_Vector, _Vector, _Vector]:
-    """:func:`trunk_axes` of an upright thorax whose SpineMid is unknown, in a frame with z up."""
-    return trunk_axes(top, (top[0], top[1], top[2] - 1.0), left, right)
+    return np.array(thorax_axes(*positions.take(_THORAX, axis=0).tolist())).T
 
 
 def posed(positions: FloatArray, local: FloatArray) -> FloatArray:
@@ -200,16 +201,16 @@ def posed(positions: FloatArray, local: FloatArray) -> FloatArray:
     In scalars, because it runs for each frame of each camera and is three times as fast as with such small arrays.
 
     Args:
-        positions: (25, 3) metres, any frame, NaN where unknown.
+        positions: (25, 3) metres, any frame (z up without SpineMid), NaN where unknown.
         local: (11, k, 3) vectors in the frame of the segment that ends in each of the joints ``LEARNT``.
 
     Returns:
-        (11, k, 3) vectors in the axes of the positions; NaN where the thorax is unknown. An unknown bone is replaced by
+        (11, k, 3) vectors in the axes of the positions; NaN without shoulders. An unknown bone is replaced by
         the one before it.
     """
     points = positions.take(LEARNT, axis=0).tolist()
     _, middle, top, *arms = points
-    (fx, fy, fz), (lx, ly, lz), (ux, uy, uz) = trunk_axes(top, middle, arms[0], arms[4])
+    (fx, fy, fz), (lx, ly, lz), (ux, uy, uz) = thorax_axes(top, middle, arms[0], arms[4])
     result = [
         [(fx * x + lx * y + ux * z, fy * x + ly * y + uy * z, fz * x + lz * y + uz * z) for x, y, z in own]
         for own in local.tolist()
@@ -240,10 +241,11 @@ def retained(positions: FloatArray) -> FloatArray:
     """(11,) ``d`` of eq. (3) and (4): 1 for the trunk and for bones that point as in a T-pose.
 
     Args:
-        positions: (25, 3) metres, any frame, NaN where unknown. An unknown bone is replaced by the one before it.
+        positions: (25, 3) metres, any frame (z up without SpineMid), NaN where unknown. An unknown bone is replaced by
+            the one before it.
     """
     points = positions.take(LEARNT, axis=0).tolist()
-    _, (lx, ly, lz), _ = trunk_axes(points[2], points[1], points[3], points[7])
+    _, (lx, ly, lz), _ = thorax_axes(points[2], points[1], points[3], points[7])
     result = [1.0] * len(points)
     for first, side in ((len(_TRUNK), 1.0), (len(_TRUNK) + 4, -1.0)):
         ux, uy, uz = math.nan, math.nan, math.nan
@@ -495,7 +497,7 @@ class JointCentres:
             stamp_ns: capture time.
 
         Returns:
-            (25, 3) without the offsets; unchanged before the first estimate, or where the thorax is not seen.
+            (25, 3) without the offsets; unchanged before the first estimate, or where the shoulders are not seen.
         """
         if self.offsets is None:
             return positions
@@ -555,7 +557,7 @@ def _offsets(sensors: list[_Evidence]) -> Offsets | None:
     if not (precision[_NEEDED] > 0.0).all():
         return None
     seen = precision > 0.0
-    points = total / np.where(seen, precision, 1.0)[:, None]
+    points = np.where(seen[:, None], total / np.where(seen, precision, 1.0)[:, None], _SPINE_UNSEEN)
     transient = np.where(seen, _TRANSIENT_SHARE / np.where(seen, precision, 1.0), _UNSEEN)
     positions = np.full((N_JOINTS, 3), np.nan)
     positions[LEARNT] = points

@@ -20,7 +20,7 @@ from typing import Final
 import numpy as np
 
 from body_tracking.calibration.arm_directions import KINECT_V2, ArmLaw, corrected_arms
-from body_tracking.calibration.joint_centres import trunk_axes, upright_axes
+from body_tracking.calibration.joint_centres import thorax_axes, trunk_axes
 from body_tracking.core.skeleton import IntArray, Joint, Skeleton
 
 BASE_FORWARD: Final = 0.036
@@ -69,7 +69,7 @@ def corrected_spine(skeleton: Skeleton) -> Skeleton:
     if not math.isfinite(thorax[0][0]):
         thorax = pelvis
     if not math.isfinite(thorax[0][0]):
-        pelvis = thorax = upright_axes(top, left_shoulder, right_shoulder)
+        pelvis = thorax = thorax_axes(top, middle, left_shoulder, right_shoulder)
     if math.isfinite(pelvis[0][0]):
         forward, _, up = pelvis
         positions[_J.SPINE_BASE] += [BASE_FORWARD * f + BASE_UP * u for f, u in zip(forward, up, strict=True)]
