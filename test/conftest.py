@@ -7,7 +7,8 @@ import gc
 import os
 import shutil
 import signal
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -120,6 +121,20 @@ class SharedNodes(LoadScopeScheduling):
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> SharedNodes | None:
     """For ``--dist loadscope``."""
     return SharedNodes(config, log) if config.getvalue("dist") == "loadscope" else None
+
+
+@pytest.fixture(autouse=True)
+def own_context() -> Iterator[None]:
+    """End the ROS context of a test that failed before it did: the next one could not begin its own."""
+
+    def there() -> bool:
+        rclpy = sys.modules.get("rclpy")
+        return rclpy is not None and bool(rclpy.ok())
+
+    before = there()
+    yield
+    if not before and there():
+        sys.modules["rclpy"].try_shutdown()
 
 
 @pytest.fixture(scope="session")
